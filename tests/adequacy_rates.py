@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.model.file import Handling, Model
 from selfcal.model.tables import Tables, make_tables
@@ -116,7 +116,7 @@ def record(
     columns = []
     for axis in (table.name for table in tables.axes):
         law = LAWS[rng.integers(3)]
-        truth = draw(model.group_of(axis), law, rng)
+        truth = draw_parameters(model.group_of(axis), law, rng)
         if effect and axis == "gx":
             law, truth = own, QUIET[own]
         y = simulate_bank_samples(law, truth, 1.0, n, int(rng.integers(2**31)))[0]

@@ -28,7 +28,7 @@ import pytest
 
 import selfcal
 from selfcal import cli
-from selfcal.bank.result import AxisResult
+from selfcal.bank.axis_result import AxisResult
 from selfcal.logs import recording as recording_module
 from selfcal.logs.loaders import Format, child
 from selfcal.logs.loaders.table import Hints

@@ -29,10 +29,10 @@ from scipy.special import ndtri
 
 from selfcal.bank.library import Bank
 from selfcal.base import units
+from selfcal.batch.batch_files import BatchSource
 from selfcal.batch.batch_summary import OTHER_LAW, Batch, summed_up
-from selfcal.batch.files import Source
-from selfcal.batch.population import FALSE_NAME, fit
-from selfcal.batch.unit_table import Unit
+from selfcal.batch.population import FALSE_NAME, fit_population
+from selfcal.batch.unit_table import BatchUnit
 from selfcal.model.file import DEFAULT, Model, read_yaml
 from selfcal.model.tables import make_tables
 from selfcal.studies.montecarlo import simulate_bank_samples
@@ -57,7 +57,7 @@ class Drawn:
 
     law: str
     seconds: int
-    units: list[Unit] = field(default_factory=list)
+    units: list[BatchUnit] = field(default_factory=list)
     odd: dict[int, str] = field(default_factory=dict)
     truth: dict[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -95,7 +95,7 @@ def axis_of(y: NDArray[np.float64], coefficient: tuple[float, float]) -> dict[st
     }
 
 
-def unit_of(random: np.random.Generator, batch: Drawn, k: int, kind: str) -> Unit:
+def unit_of(random: np.random.Generator, batch: Drawn, k: int, kind: str) -> BatchUnit:
     """The k-th unit, with its fault."""
     own = {name: middle + spread * random.standard_normal() for name, (middle, spread) in batch.truth.items()}
     if kind in FACTOR:
@@ -116,7 +116,7 @@ def unit_of(random: np.random.Generator, batch: Drawn, k: int, kind: str) -> Uni
             y[int(batch.seconds * random.uniform(0.2, 0.8)) :] += STEP * random.choice((-1.0, 1.0))
         axis = axis_of(y, coefficient)
         if kind != "law" or behind(axis, batch.law) >= NATS:
-            return Unit(Source(f"u{k}", device=f"u{k}"), {"recording": {}, "axes": {"gx": axis}})
+            return BatchUnit(BatchSource(f"u{k}", device=f"u{k}"), {"recording": {}, "axes": {"gx": axis}})
         size *= 1.1
 
 
@@ -160,7 +160,7 @@ def judged(batch: Drawn, found: Batch) -> tuple[dict[int, bool], dict[int, bool]
         middle, spread = batch.truth[name]
         drift = ("law", "step") if name in ("K", "sigma_m", "alpha") else ("step",) if name == "bias" else ()
         clean = np.array([batch.odd.get(place) not in (name, *drift) for place in one.at.tolist()])
-        others = fit(one.y[clean], one.s[clean])
+        others = fit_population(one.y[clean], one.s[clean])
         for place, y, s in zip(one.at.tolist(), one.y, one.s, strict=True):
             kind = batch.odd.get(place)
             if kind != name and not (kind == "step" and name in ("K", "sigma_m")):

@@ -27,8 +27,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
-from selfcal.bank.result import HALF_90
 from selfcal.logs.recording import as_float, load
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.regressors import columns_of, mask_of, offered
@@ -36,7 +36,7 @@ from selfcal.model.tables import make_tables
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
-from selfcal.wire.ahead import Known, error_ahead
+from selfcal.wire.ahead import KnownBias, error_ahead
 
 LENGTH_S, HORIZONS_S = 2400, (10, 60, 300)
 #: Of real recordings: their names, the rest, the horizons, and the block that shows the bias, s.
@@ -104,7 +104,7 @@ def errors(effects: Sequence[str], target: str, seed: int, folder: Path) -> NDAr
     return np.array(found)
 
 
-def known_by(bank: Bank, model: Model, time_s: float) -> Known:
+def known_by(bank: Bank, model: Model, time_s: float) -> KnownBias:
     """What a module would report: without regressors or with all, whichever is the likelier."""
     regressors = offered(model, "gx")
     places = sum(len(one.columns) for one in regressors)
@@ -116,7 +116,7 @@ def known_by(bank: Bank, model: Model, time_s: float) -> Known:
             best = whole
             means = np.array([[mean for mean, _ in whole.coefficients[law]] for law in whole.probability])
             coefficients = np.array(list(whole.probability.values())) @ means
-    return Known(time_s, best.bias_mean, coefficients)
+    return KnownBias(time_s, best.bias_mean, coefficients)
 
 
 def second_errors(effects: Sequence[str], seed: int, folder: Path) -> NDArray[np.float64]:

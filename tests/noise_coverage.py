@@ -35,10 +35,10 @@ import yaml
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from selfcal.adequacy.one_over_f import SURE, Rerun, weigh, with_white
+from selfcal.adequacy.one_over_f import SURE_PROBABILITY, Rerun, weigh, with_white
 from selfcal.adequacy.summary import summarize
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult
 from selfcal.base.units import FLICKER_FLOOR
 from selfcal.logs.recording import as_float
 from selfcal.model.file import DEFAULT, Group, Model, Prior
@@ -107,7 +107,7 @@ def numbers_of(
     beside = weigh(Rerun(tables, group, samples, np.zeros(samples.size, np.int64)))
     found = summarize(result, group, tables.dt_s, samples.size // tables.block, tables.block, beside)
     known = {key: quantiles(number.estimate) for key, number in found.items() if number.estimate.identified}
-    return result, known, beside is not None and beside.probability >= SURE
+    return result, known, beside is not None and beside.probability >= SURE_PROBABILITY
 
 
 def of_default(random: np.random.Generator, seconds: float, law: str) -> Iterator[Found]:

@@ -19,9 +19,9 @@ from unittest import mock
 import numpy as np
 import yaml
 
+from selfcal.base.grid import Array
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import DEFAULT
-from selfcal.model.simulated_parts import Floats
 from selfcal.studies import outage
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.simulate import simulate
@@ -31,7 +31,7 @@ N, K, DURATION_S = 3e-3, 2e-5, 3600.0
 COEFFICIENT, AMPLITUDE, TAU_S = 0.004, 0.3, 600.0
 #: By cause: the effect on the first record, on the second one, and what it adds to the second one's readings, by time
 #: and temperature.
-EFFECTS: dict[str, tuple[str, str | None, Callable[[Floats, Floats], Floats]]] = {
+EFFECTS: dict[str, tuple[str, str | None, Callable[[Array, Array], Array]]] = {
     "temperature": (
         of := f"temperature:axis=gx,coefficient={COEFFICIENT}",
         of,
@@ -61,11 +61,11 @@ def part(folder: Path) -> Path:
     return path
 
 
-def of_truth(second: Recording, added: Callable[[Floats, Floats], Floats]) -> dict[str, Any]:
+def of_truth(second: Recording, added: Callable[[Array, Array], Array]) -> dict[str, Any]:
     """Flights with the second record's errors by a filter that is told the truth."""
     time_s = np.arange(second.samples) / second.rate_hz
     errors = second.columns["gx"].values - added(time_s, second.columns["temp"].values)
-    return outage.flights({"gx": outage.Known({"N": N, "K": K}, errors - np.median(errors))})
+    return outage.flights({"gx": outage.KnownAxis({"N": N, "K": K}, errors - np.median(errors))})
 
 
 def stated(cause: str, seed: int, folder: Path) -> dict[str, Mapping[str, Any]] | None:

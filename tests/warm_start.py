@@ -28,9 +28,9 @@ import yaml
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
-from selfcal.bank.result import HALF_90
-from selfcal.diagnosis.warm import RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, load, warmed
+from selfcal.diagnosis.warm import RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, load_start, warmed
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import Tables, make_tables
 from selfcal.verbs.diagnose import diagnose
@@ -61,7 +61,7 @@ def both(model: Path, diagnosis: Path) -> dict[str, Tables]:
     """The tables of gx, cold and warm."""
     loaded = Model.load(model)
     cold = make_tables(loaded, 1.0, ("gx",))
-    return {"cold": cold, "warm": warmed(cold, load(diagnosis, loaded))}
+    return {"cold": cold, "warm": warmed(cold, load_start(diagnosis, loaded))}
 
 
 def law_known(tables: Tables) -> Tables:

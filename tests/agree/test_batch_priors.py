@@ -19,10 +19,10 @@ import yaml
 from scipy import integrate, stats
 from test_docs import assert_alike
 
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
-from selfcal.bank.reference import identify_axis
-from selfcal.bank.result import HALF_90
+from selfcal.bank.reference import reference_axis
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
 from selfcal.model.file import DEFAULT, Model, Prior
@@ -79,12 +79,12 @@ def test_library_and_reference_agree_on_log_normal_priors(priors: dict[str, Prio
     tables = make_tables(model, 1.0, ("gx",))
     for n in case_records((60, 400), (40, 60, 120, 400, 1500)):
         for seed in range(case_records(1, 5)):
-            truth = draw(group, law, np.random.default_rng([n, seed, len(priors)]))
+            truth = draw_parameters(group, law, np.random.default_rng([n, seed, len(priors)]))
             y, _ = simulate_bank_samples(law, truth, 1.0, n, seed)
             y = y.astype(np.float32).astype(np.float64)
             bank = Bank(tables)
             bank.push(y[:, None])
-            ours, theirs = bank.report(0), identify_axis(y, 1.0, group, MODEL.hypotheses)
+            ours, theirs = bank.report(0), reference_axis(y, 1.0, group, MODEL.hypotheses)
             evidence, probability, mean, sd = worst_difference(ours, theirs)
             assert evidence <= 0.05 and probability <= 0.0125 and mean <= 0.05 and sd <= 0.03, (n, seed)
             likeliest = max(theirs.probability, key=lambda name: theirs.probability[name])

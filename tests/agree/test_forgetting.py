@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.model.file import Model, Regressor
@@ -62,7 +62,7 @@ def test_the_likelihood_is_that_of_the_weighted_record(with_time: bool) -> None:
 def test_float_and_integers_forget_as_double_does(fixed: bool) -> None:
     """5000 half-lives: what rounding leaves must fade as well. Tolerances of the design: 1e-3 and 0.02 sd in float,
     5e-3 and 0.05 sd in integers."""
-    truth = draw(MODEL.group_of("gx"), "gauss_markov", np.random.default_rng(3))
+    truth = draw_parameters(MODEL.group_of("gx"), "gauss_markov", np.random.default_rng(3))
     y = simulate_bank_samples("gauss_markov", truth, 1.0, 300_000, 3)[0][:, None]
     made = tables(60.0)
     bank, exact = Bank(made, build="_fixed" if fixed else "_library32"), Bank(made, build="_library64")
@@ -105,7 +105,7 @@ def test_white_noise_is_no_random_walk() -> None:
 
 def test_nothing_is_forgotten_within_a_short_record() -> None:
     """A half-life of 10^6 records: the same as without, to what a 10^-6 th part of n ln V can do."""
-    truth = draw(MODEL.group_of("gx"), "random_walk", np.random.default_rng(2))
+    truth = draw_parameters(MODEL.group_of("gx"), "random_walk", np.random.default_rng(2))
     y = simulate_bank_samples("random_walk", truth, 1.0, 1000, 2)[0][:, None]
     banks = Bank(tables(1e9), build="_library64"), Bank(tables(0.0), build="_library64")
     for bank in banks:

@@ -15,7 +15,7 @@ import yaml
 from scipy import stats
 
 from selfcal import _reference
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.model.file import DEFAULT, Model
@@ -39,7 +39,7 @@ OWN = [name for name in MODEL.hypotheses if name not in NAMED]
 
 def a_record(law: str, n: int, seed: int) -> np.ndarray:
     """[n] bank samples of a law, its parameters from the prior, as float32 holds them."""
-    truth = draw(GROUP, law, np.random.default_rng([n, seed]))
+    truth = draw_parameters(GROUP, law, np.random.default_rng([n, seed]))
     y, _ = simulate_bank_samples(MODEL.laws[law], truth, 1.0, n, seed=seed)
     return y.astype(np.float32).astype(np.float64)
 
@@ -69,7 +69,7 @@ def covariance(law: str, parameters: dict[str, float], n: int) -> np.ndarray:
 def test_the_textbook_reads_the_terms(law: str) -> None:
     """ln p of a record against the normal density with the covariance of the law's definition: 1e-8, double rounding
     through 40 samples."""
-    truth = draw(GROUP, law, np.random.default_rng([40, 3]))
+    truth = draw_parameters(GROUP, law, np.random.default_rng([40, 3]))
     y = a_record(law, 40, 3)
     y -= y.mean()  # a bias of many P0 would cost digits
     drift, second = MODEL.laws[law].node(truth)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.model.file import Model
 from selfcal.model.laws import NAMED, PLAIN
@@ -38,7 +38,7 @@ def only(law: str) -> Tables:
 
 def simulate(law: str, samples: int, rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """A record y [samples] at 1 Hz with parameters from the prior, and x0 + drift [samples + 1000] at every second."""
-    truth = draw(MODEL.group_of("gx"), law, rng)
+    truth = draw_parameters(MODEL.group_of("gx"), law, rng)
     steps = rng.standard_normal(samples + 1000)
     drift = np.zeros(samples + 1000)
     if law == "random_walk":

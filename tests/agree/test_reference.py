@@ -14,16 +14,16 @@ from scipy import integrate, interpolate, special, stats
 
 from selfcal import _reference
 from selfcal.bank import reference
-from selfcal.bank.reference import identify_axis
+from selfcal.bank.reference import reference_axis
 from selfcal.base.errors import UserError
 from selfcal.model.file import Group, Prior
-from selfcal.model.laws import NAMED, PLAIN, named
+from selfcal.model.laws import NAMED, PLAIN, named_law
 
 DT = 0.7
 BIAS_SD = 3.0
 BIAS_MEAN = 0.4
 #: The named laws; walk and Markov with a correlation time of 20 s.
-LAWS = [named(name, 20.0).as_tuple for name in NAMED]
+LAWS = [named_law(name, 20.0).as_tuple for name in NAMED]
 #: (law: an index into LAWS, drift, alpha or ratio, sigma_v)
 NODES = [(0, 0.0, 1.0, 0.3), (1, 0.2, 1.0, 0.3), (2, 0.5, 0.08, 0.3), (2, 0.5, 4.0, 0.05), (1, 2.0, 1.0, 1e-3)]
 #: Double precision through 30 samples; the worst node has P0 / sigma_v^2 = 1e7.
@@ -336,7 +336,7 @@ def test_engine_equals_quadrature_over_the_prior_box(prior: str) -> None:
     y, r = a_record(10, seed=4)
     a_group = group(prior)
     odds = {"constant": 0.5, "random_walk": 0.2, "gauss_markov": 0.3}
-    result = identify_axis(y, DT, a_group, odds, r)
+    result = reference_axis(y, DT, a_group, odds, r)
     assert result.n == np.isfinite(y).sum()
     truth = {name: box_quadrature(y, r, name, a_group, 16) for name in PLAIN}
     probability = special.softmax([np.log(odds[name]) + truth[name]["ln_evidence"] for name in PLAIN])
@@ -385,7 +385,7 @@ def test_constant_law_against_its_closed_form(n: int, sd: float) -> None:
     width = 8.0 / np.sqrt(2 * n) if 0.05 < sd < 1.0 else 40.0 / n
     reach = (centre - width, centre + width) if n > 3 else (-9.0, 9.0)
     total = integral(*reach)
-    result = identify_axis(y, DT, a_group, {"constant": 1.0})
+    result = reference_axis(y, DT, a_group, {"constant": 1.0})
     expected = np.log(total) + peak - np.log(np.log(prior.max / prior.min))
     assert result.log_evidence["constant"] == pytest.approx(expected, abs=4e-4)
     estimate = result.parameters["constant"]["N"]
@@ -412,7 +412,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
         scene = _reference.Scene()
         scene.seed, scene.rate_hz, scene.samples = seed, 1.0 / DT, 300
         y = _reference.simulate(scene, [axis])[0][0]
-        estimates = identify_axis(y, DT, a_group, {"random_walk": 1.0}).parameters["random_walk"]
+        estimates = reference_axis(y, DT, a_group, {"random_walk": 1.0}).parameters["random_walk"]
         for parameter, true in (("N", axis.N), ("K", axis.drift)):
             held[parameter] += estimates[parameter].q05 <= true <= estimates[parameter].q95
     low, high = stats.binom(200, 0.9).ppf([0.001, 0.999])
@@ -424,7 +424,7 @@ def test_a_large_offset_changes_nothing_but_the_bias() -> None:
     """10^4 units of offset under a flat bias prior: the same posterior, the bias moved by the offset."""
     flat = Group("test", ("gx",), "deg/s", 0.0, 0.0, 0, {**group().priors, "bias": Prior("normal", sd=1e6)})
     y, r = a_record(60)
-    near, far = (identify_axis(y + offset, DT, flat, {"random_walk": 1.0}, r) for offset in (0.0, 1e4))
+    near, far = (reference_axis(y + offset, DT, flat, {"random_walk": 1.0}, r) for offset in (0.0, 1e4))
     assert far.bias_mean - near.bias_mean == pytest.approx(1e4, abs=1e-4)
     assert far.bias_sd == pytest.approx(near.bias_sd, rel=1e-4)
     for name, estimate in near.parameters["random_walk"].items():
@@ -432,11 +432,11 @@ def test_a_large_offset_changes_nothing_but_the_bias() -> None:
 
 
 def test_a_grid_out_of_reach_is_an_error_not_a_hang(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reference, "_MOST", 100)
+    monkeypatch.setattr(reference, "_NODES_MOST", 100)
     with pytest.raises(UserError, match="more than 100 nodes"):
-        identify_axis(a_record(30)[0], DT, group(), {"random_walk": 1.0})
+        reference_axis(a_record(30)[0], DT, group(), {"random_walk": 1.0})
 
 
 def test_no_sample_is_an_error() -> None:
     with pytest.raises(UserError, match="no sample"):
-        identify_axis(np.full(5, np.nan), 1.0, group(), {"constant": 1.0})
+        reference_axis(np.full(5, np.nan), 1.0, group(), {"constant": 1.0})

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
 from selfcal.bank import reference
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
@@ -71,7 +71,7 @@ def test_report_of_a_subset_against_the_continuous_reference(law: str) -> None:
     last = int(np.flatnonzero(present)[-1]) + 1
     sd = [column.coefficient_sd[0] for column in tables.regressors]
     centred = z - np.array([column.reference for column in tables.regressors])
-    dense = reference.identify_axis(y[:last], 1.0, GROUP, MODEL.hypotheses, None, centred[:last], sd)
+    dense = reference.reference_axis(y[:last], 1.0, GROUP, MODEL.hypotheses, None, centred[:last], sd)
     report = bank.report(0, 0b111)
     assert report.bias_mean == pytest.approx(dense.bias_mean, abs=0.05 * dense.bias_sd)
     assert report.bias_sd == pytest.approx(dense.bias_sd, rel=0.05)
@@ -92,7 +92,7 @@ def test_intervals_of_a_coefficient_hold_the_truth_as_often_as_they_say() -> Non
     held = 0
     for seed in range(200):
         rng = np.random.default_rng([seed, 5])
-        truth = draw(GROUP, "random_walk", rng)
+        truth = draw_parameters(GROUP, "random_walk", rng)
         coefficient = tables.regressors[0].coefficient_sd[0] * rng.normal()
         z = columns_of(200, seed)[:, :1]
         y = simulate_bank_samples("random_walk", truth, 1.0, 200, seed=seed)[0] + coefficient * z[:, 0]

@@ -20,7 +20,7 @@ from scipy.stats import binom
 
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.library import Bank
-from selfcal.bank.reference import identify_axis
+from selfcal.bank.reference import reference_axis
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import load
 from selfcal.model.laws import PLACES
@@ -122,7 +122,7 @@ def test_rows_are_summed_where_the_search_found_them(n: int, seed: int) -> None:
     bank = Bank(tables_of(MODEL))
     push(bank, y)
     evidence, _, mean, sd = worst_difference(
-        bank.report(0), identify_axis(y, 1.0, MODEL.group_of("gx"), MODEL.hypotheses)
+        bank.report(0), reference_axis(y, 1.0, MODEL.group_of("gx"), MODEL.hypotheses)
     )
     print(f"\nn={n}: d ln evidence {evidence:.3f}, d mean {mean:.3f} sd, sd {100 * sd:.1f} %")
     assert (np.array([evidence, mean, sd]) <= REPORT_LIMIT).all()

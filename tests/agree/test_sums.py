@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
+from selfcal.bank.axis_result import in_unit
 from selfcal.bank.library import Bank
-from selfcal.bank.reference import identify_axis
-from selfcal.bank.result import in_unit
+from selfcal.bank.reference import reference_axis
 from selfcal.base.errors import UserError
 from selfcal.model.file import Model
 from selfcal.model.laws import PLACES, SUMS
@@ -163,7 +163,7 @@ def test_drift_that_nearly_hides_the_white_noise(
     bank = Bank(tables("host", only=law), build="_coarse" if coarse else "_library32")
     push(bank, y)
     entry = next(h for h in bank.raw.report(0)["hypotheses"] if h["probability"] > 0.5)
-    right = identify_axis(y, 1.0, GROUP, {law: 1.0}).parameters[law]
+    right = reference_axis(y, 1.0, GROUP, {law: 1.0}).parameters[law]
     for name, one in right.items():
         mean, _, sd = entry["parameters"][PLACES[name]][:3]
         assert mean == pytest.approx(one.mean, abs=0.05 * one.sd), name
@@ -227,7 +227,7 @@ def test_intervals_hold_what_they_say(law: str) -> None:
     made = tables(only=law)
     inside: dict[str, int] = {}
     for seed in range(records):
-        truth = draw(GROUP, law, np.random.default_rng([9, seed, len(law)]))
+        truth = draw_parameters(GROUP, law, np.random.default_rng([9, seed, len(law)]))
         y, bias = simulate_bank_samples(GROUP.laws[law], truth, 1.0, 500, seed=5000 + seed)
         bank = Bank(made)
         push(bank, y)
@@ -247,7 +247,7 @@ def test_the_reference_engine_answers_alike(law: str) -> None:
     y, _ = a_record(law, 200, 11)
     bank = Bank(tables(only=law))
     push(bank, y)
-    ours, theirs = bank.report(0), identify_axis(y, 1.0, GROUP, {law: 1.0})
+    ours, theirs = bank.report(0), reference_axis(y, 1.0, GROUP, {law: 1.0})
     evidence, _, mean, sd = worst_difference(ours, theirs)
     print(f"\n{law}: d ln evidence {evidence:.3f}, d mean {mean:.3f} sd, sd {100 * sd:.1f} %")
     assert evidence <= 0.05

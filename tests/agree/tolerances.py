@@ -27,10 +27,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
 from selfcal.bank import reference
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult
 from selfcal.logs.recording import load
 from selfcal.model.laws import NAMED, PLAIN, SUMS
 from selfcal.model.tables import make_tables
@@ -210,7 +210,7 @@ def refined(law: str, n: int, seeds: int) -> list[Row]:
         y, _ = a_record(law, n, seed)
         bank = Bank(tables_of(model, only=law if law in SUMS else None))
         push(bank, y)
-        exact = reference.identify_axis(y, 1.0, group, hypotheses)
+        exact = reference.reference_axis(y, 1.0, group, hypotheses)
         found.append(worst_difference(bank.report(0), exact))
         excused.append(law in SUMS and off_grid(bank, 0, exact))
     evidence, probability, mean, sd = np.max(found, axis=0).tolist()
@@ -225,7 +225,7 @@ def six_axes(n: int, seed: int) -> tuple[str, Floats]:
     y = []
     for index, axis in enumerate(MODEL.axes):
         law = PLAIN[(index + seed) % len(PLAIN)]
-        truth = draw(MODEL.group_of(axis), law, np.random.default_rng([n, seed, index]))
+        truth = draw_parameters(MODEL.group_of(axis), law, np.random.default_rng([n, seed, index]))
         y.append(simulate_bank_samples(law, truth, 1.0, n, seed=100 * seed + index)[0])
     return "drawn", np.column_stack(y)
 

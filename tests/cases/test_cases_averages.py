@@ -16,10 +16,10 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from selfcal.adequacy.checks import drift_check, judge
+from selfcal.adequacy.checks import drift_check, judge_record
 from selfcal.bank.blocks import Blocks
 from selfcal.bank.library import Bank
-from selfcal.bank.reference import identify_axis
+from selfcal.bank.reference import reference_axis
 from selfcal.logs.recording import save
 from selfcal.model.file import Model, Prior
 from selfcal.model.laws import lost_of
@@ -94,7 +94,7 @@ def ensemble(law: str, truth: Mapping[str, float], seed: int) -> dict[str, float
         bank.push(np.repeat(y, BLOCK)[:, None])
         report = bank.report(0)
         estimates = report.parameters[law]
-        judged = judge(Blocks(y, np.ones(BLOCKS), math.nan, {}, np.empty((BLOCKS, 0))), TABLES, GROUP, report)
+        judged = judge_record(Blocks(y, np.ones(BLOCKS), math.nan, {}, np.empty((BLOCKS, 0))), TABLES, GROUP, report)
         one = {name: estimates[name].q05 <= value <= estimates[name].q95 for name, value in truth.items()}
         one["bias"] = abs(report.bias_mean - now) < 1.6449 * report.bias_sd
         one["adequate"] = all(check["passed"] for check in judged.checks.values())
@@ -247,7 +247,7 @@ def test_both_engines_have_the_bias_of_the_last_sample(drift: tuple[str, dict[st
     bank.push(samples[:, None])
     y = samples.reshape(-1, BLOCK).mean(axis=1)
     before, ours = (bank.report(0, 0, ahead_s) for ahead_s in (0.0, 0.8))
-    theirs = identify_axis(y, TABLES.dt_s, GROUP, MODEL.hypotheses, block=BLOCK, ahead_s=0.8)
+    theirs = reference_axis(y, TABLES.dt_s, GROUP, MODEL.hypotheses, block=BLOCK, ahead_s=0.8)
     assert ours.bias_mean == pytest.approx(theirs.bias_mean, abs=0.05 * theirs.bias_sd)
     assert ours.bias_sd == pytest.approx(theirs.bias_sd, rel=0.03)
     assert ours.bias_sd > 1.1 * before.bias_sd

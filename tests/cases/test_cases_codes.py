@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from selfcal.likelihood.statemodel import Array
+from selfcal.base.grid import Array
 from selfcal.logs.recording import save
 from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import UNEVEN, codes_of
-from selfcal.readings.held import slower
+from selfcal.readings.held import slower_stretches
 from selfcal.readings.lattice import lattice_of
 from selfcal.verbs.diagnose import diagnose
 
@@ -187,5 +187,5 @@ def test_readings_that_are_equal_by_chance_are_no_stretch(kind: str) -> None:
             level = float(np.median(y))
             part = slice(int(random.uniform(0.1, 0.8) * y.size), None)
             y[part] = level + (y[part] - level) * (random.uniform(2.0, 5.0) if kind == "louder" else 0.2)
-        named += bool(slower(rounded(y, q)))
+        named += bool(slower_stretches(rounded(y, q)))
     assert named <= binom.isf(1e-3, count, 1.0 / 200.0)

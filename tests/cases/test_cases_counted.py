@@ -189,5 +189,5 @@ def test_units_of_a_counter() -> None:
     for unit, times in (("deg/s", "deg"), ("rad/s", "rad"), ("m/s^2", "m/s"), ("g", "g*s"), ("deg/h", "deg/h*s")):
         assert units.times_second(unit) == times
         assert units.same_kind(f"{unit}*s", times) and units.factor(f"{unit}*s", times) == pytest.approx(1.0)
-    assert units.convert(1.0, "deg", "arcsec") == pytest.approx(3600.0)
+    assert units.converted(1.0, "deg", "arcsec") == pytest.approx(3600.0)
     assert units.datasheet_unit("quantization_noise", "mg") == "m/s"

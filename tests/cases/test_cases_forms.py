@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.cause import Channels
 from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.channel_looks import added, inconstancy
 from selfcal.diagnosis.finding import Diagnosed
-from selfcal.diagnosis.forms import added, inconstancy
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, State

@@ -20,7 +20,7 @@ from selfcal.diagnosis.finding import Diagnosed, HeldOut
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import edges
 from selfcal.likelihood.fit import passed
-from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State
+from selfcal.likelihood.state import NET_LEAST, FittedColumn, Look, State
 from selfcal.likelihood.statemodel import Terms
 
 from conftest import case_records
@@ -48,7 +48,7 @@ def test_the_evidence_is_that_of_the_dense_covariance() -> None:
     n, rho, size = 70, 0.3, 0.7
     y = of_one(random, n, 0.012, 300.0) + 3.0
     column = np.where(np.arange(n) < 40, 0.0, 1.0)
-    state = State("gx", "deg/s", y, 1.0, 0.0, np.ones(n), (Regressor("c", "step", column, "1", {}),))
+    state = State("gx", "deg/s", y, 1.0, 0.0, np.ones(n), (FittedColumn("c", "step", column, "1", {}),))
     marks = [30, 50, 70]
     G, D, used, _, _, _ = passed(state.series, Terms(walk=True), np.array([math.log(rho)]), marks)
     found = score._posterior(G, D, used, np.array([math.inf, size]))[0]
@@ -84,7 +84,7 @@ def test_a_right_step_gains_and_a_false_one_does_not(late: bool) -> None:
             scan = edges.scan(state.series, state.best)
             inside = np.arange(SAMPLES) >= SAMPLES // 2
             at = int(np.argmax(np.where(inside == late, scan.gain, 0.0)))
-            column = Regressor("step", "step", edges.raised(SAMPLES, at), "1", {"kind": "step", "time_s": float(at)})
+            column = FittedColumn("step", "step", edges.raised(SAMPLES, at), "1", {"kind": "step", "time_s": float(at)})
             gain = state.with_columns(column.values)[0]
             look = Look("step", gain, scan.worth(gain), {}, {"regressors": (column,)}, when=(float(at), float(at)))
             gains.append(nats(score.gain(look, state, state.refit(**look.changes), record)))

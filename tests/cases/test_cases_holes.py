@@ -125,7 +125,7 @@ sys.path[:] = {path!r}
 from selfcal.base import ending
 from selfcal.batch.spread import spread
 from test_cases_holes import slow
-ending.install()
+ending.install_signals()
 spread(partial(slow, Path(sys.argv[1])), range(4))
 """
 

@@ -22,8 +22,8 @@ import pytest
 import yaml
 
 from selfcal.base.errors import UserError, remark
-from selfcal.diagnosis.extend import as_text
-from selfcal.diagnosis.warm import load as load_start
+from selfcal.diagnosis.extend import model_text
+from selfcal.diagnosis.warm import load_start
 from selfcal.logs.recording import load, save
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import make_tables
@@ -32,7 +32,7 @@ from selfcal.verbs.codegen import codegen
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.wire.c_tables import bank_bytes, write_tables
-from selfcal.wire.dbc_file import Names, dbc
+from selfcal.wire.dbc_file import Names, dbc_text
 
 from conftest import ROOT, case_records
 
@@ -196,13 +196,13 @@ def test_names_end_no_comment(part: Part, tmp_path: Path) -> None:
 
     def outputs(name: str) -> dict[str, str]:
         document = {**part.answer, "recording": {**part.answer["recording"], "path": f"/folder/{name}"}}
-        made = {"model": as_text(tree, name, f"read-out of {name}")}
+        made = {"model": model_text(tree, name, f"read-out of {name}")}
         for form in FORMS:
             write_export(document, form, tmp_path / form)
             made[form] = (tmp_path / form).read_text()
         write_tables(part.model, tables, tmp_path / "c", "host", f"gx from {name}, 600 s")
         made["c"] = (tmp_path / "c" / "selfcal_model.h").read_text()
-        made["dbc"] = dbc(0, Names((name, "b"), (("N",), ("N",)), ((name, name),)), ("gx",))
+        made["dbc"] = dbc_text(0, Names((name, "b"), (("N",), ("N",)), ((name, name),)), ("gx",))
         return made
 
     plain = {form: content(form, text) for form, text in outputs("plain").items() if form != "dbc"}

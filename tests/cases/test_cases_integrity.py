@@ -21,14 +21,14 @@ from scipy.signal import lfilter
 from selfcal.adequacy.identify import identify_axis
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.record import record_from
 from selfcal.logs.recording import Column, Recording, load, save
 from selfcal.logs.sampling import rate_changes, sampling
 from selfcal.model.file import Model
-from selfcal.readings.held import held as held_rows
+from selfcal.readings.changed_words import misread_of
+from selfcal.readings.held import held_of as held_rows
 from selfcal.readings.lattice import lattice_of
 from selfcal.readings.lost_words import recurring_of
-from selfcal.readings.misread import misread_of
 from selfcal.readings.readings import evened, look
 from selfcal.verbs.diagnose import diagnose
 
@@ -90,7 +90,7 @@ def judged(recording: Recording) -> Diagnosed:
     """What the diagnosis finds, without a library's warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return diagnose_record(of_recording(recording, MODEL), ["gx"])["gx"]
+        return diagnose_record(record_from(recording, MODEL), ["gx"])["gx"]
 
 
 def causes(one: Mapping[str, Any]) -> list[str]:
@@ -152,7 +152,7 @@ def test_the_means_of_the_real_runs_show_no_lattice_statistic() -> None:
         }
         means = replace(recorded, rate_hz=10.0, columns=columns, missing_before=np.zeros(n // 10, np.int64))
         keys = ("repeated_readings", "equal_readings", "longest_repeat", "odd_even_codes")
-        for name, state in of_recording(means, MODEL).axes.items():
+        for name, state in record_from(means, MODEL).axes.items():
             rows = {row.name: row.p for row in statistics(state.refit(), count=24).statistics}
             assert min(rows[key] for key in keys if key in rows) > 1e-6, (number, name)
 
@@ -223,7 +223,7 @@ def test_lost_words_are_named_and_spoil_nothing(share: float, rate: float, q: fl
         np.testing.assert_array_equal(found.mask, lost)
         if seed == 0:
             for decimate in (1.0, None) if rate < 50.0 or case_records(0, 1) else (1.0,):
-                one = diagnose_record(of_recording(recording, MODEL, decimate), ["gx"])["gx"]
+                one = diagnose_record(record_from(recording, MODEL, decimate), ["gx"])["gx"]
                 assert [finding.look.cause for finding in one.findings] == ["outliers"]
     held.check()
 
@@ -487,7 +487,7 @@ def test_a_logger_a_little_faster_than_the_part(
         # The polls that were lost are one reading each, or a repeat; late polls that miss a reading are fewer.
         assert found.recording.missing_before.sum() <= (lost + 0.1 * jitter + 0.001) * y.size
         if seed == 0:
-            both = (of_recording(one, MODEL, 1.0) for one in (recording, a_recording(y, 100.0)))
+            both = (record_from(one, MODEL, 1.0) for one in (recording, a_recording(y, 100.0)))
             logged, own = ([f.look.cause for f in diagnose_record(one, ["gx"])["gx"].findings] for one in both)
             unread = 1.0 - np.unique(row[kept]).size / (row[-1] - row[0] + 1.0)
             if unread > 5e-4:  # `missing_samples` is from 1e-3 on
@@ -542,7 +542,7 @@ def test_one_slow_axis_leaves_the_others_at_their_rate() -> None:
     fast, slow = noise(random, 8000, 100.0)[0], np.repeat(noise(random, 2000, 25.0)[0], 4)
     both = a_recording(fast, 100.0)
     both = replace(both, columns={**both.columns, "gy": Column("gy", "deg/s", slow)})
-    record = of_recording(both, MODEL)
+    record = record_from(both, MODEL)
     found = diagnose_record(record, ["gx", "gy"])
     assert not found["gx"].findings
     assert [one.look.cause for one in found["gy"].findings] == ["held_samples"]
@@ -608,7 +608,7 @@ def test_changes_of_rate_are_found_and_spoil_nothing(rates: tuple[float, ...]) -
         places = np.cumsum(np.array(counts) / rates)[:-1]
         assert [one.time_s for one in changes] == pytest.approx(places, abs=10.0 / min(rates))
         if seed == 0 and len(rates) == 3:
-            found = diagnose_record(of_recording(recording, MODEL, 1.0), ["gx"])["gx"]
+            found = diagnose_record(record_from(recording, MODEL, 1.0), ["gx"])["gx"]
             assert [one.look.cause for one in found.findings] == ["rate_change"] * 2 + ["missing_samples"]
     assert failed <= records // 50
     held.check()

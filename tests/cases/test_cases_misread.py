@@ -18,14 +18,14 @@ from scipy.stats import binom
 from selfcal.adequacy.identify import identify_axis
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.record import record_from
 from selfcal.logs.recording import Column, Recording
 from selfcal.model.file import Model
 from selfcal.readings.budget import SHARES
-from selfcal.readings.misread import spans_of
-from selfcal.readings.motion import moves_of
+from selfcal.readings.changed_words import spans_of
+from selfcal.readings.faults import FAULTS
+from selfcal.readings.moves import moves_of
 from selfcal.readings.readings import look
-from selfcal.readings.tests import TESTS
 
 from conftest import case_records
 
@@ -110,7 +110,7 @@ def test_a_map_of_the_readings_is_named_in_both_verbs(read: Callable[[Array, Ran
             estimate = found.result.parameters["constant"]["N"]
             assert abs(estimate.mean - N) < 4.0 * estimate.sd
         if seed == 0:
-            one = diagnose_record(of_recording(recording, MODEL, 1.0), ["gx"])["gx"]
+            one = diagnose_record(record_from(recording, MODEL, 1.0), ["gx"])["gx"]
             assert [finding.look.estimate["kind"] for finding in one.findings if finding.look.cause == "misread"] == [
                 read.__name__
             ]
@@ -283,8 +283,8 @@ def test_sound_readings_are_called_so() -> None:
         recording = sound(np.random.default_rng([95, k]), k)
         for axis in recording.columns:
             seen = look(recording, axis, MODEL.group_of(axis))
-            for test in TESTS:
-                named[test.name] += test.statistic(seen) > 0.0
+            for fault in FAULTS:
+                named[fault.name] += fault.statistic(seen) > 0.0
     print(named)
     assert sum(named.values()) <= binom.isf(1e-3, 3 * count, 2e-3)
     for name, share in SHARES.items():
@@ -309,7 +309,7 @@ def test_shaken_stretches_are_left_out_in_both_verbs(axes: int, seconds: float, 
     if axes > 1 or seconds * louder > 4.0:  # one axis alone: 11 of 12
         assert len({*moved} & {*found}) >= len(moved) - (seconds < 1.0 and axes > 1)
         assert len(found) <= len(moved) + 1
-    record = of_recording(recording, MODEL, 1.0)
+    record = record_from(recording, MODEL, 1.0)
     for name in found:
         ((begin, end),) = found[name].intervals
         assert abs(begin - 371.3) < 1.5 and abs(end - 371.3 - seconds) < 1.5

@@ -17,17 +17,16 @@ from scipy.stats import binom
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.base.errors import UserError
-from selfcal.base.grid import block_means
+from selfcal.base.grid import Array, block_means
 from selfcal.diagnosis import words
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.record import record_from
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Column, Recording, save
 from selfcal.model.file import Model
-from selfcal.readings.misread import spans_of
-from selfcal.readings.motion import Moved, moves_of
+from selfcal.readings.changed_words import spans_of
+from selfcal.readings.moves import Moved, moves_of
 from selfcal.readings.readings import look
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -362,7 +361,7 @@ def rested(random: np.random.Generator, kind: str) -> tuple[Diagnosed, float, fl
     y = start + random.standard_normal(n) + K * (random.standard_normal(n).cumsum())
     moved = t < 30.0 if kind == "start" else t >= n - 30.0 if kind == "end" else (t >= 1200.0) & (t < 1230.0)
     y[moved] += in_hand(random, t[moved], 100.0)
-    return diagnose_record(of_recording(a_recording(1.0, y), MODEL), ["gx"])["gx"], math.log(K), start
+    return diagnose_record(record_from(a_recording(1.0, y), MODEL), ["gx"])["gx"], math.log(K), start
 
 
 def test_the_rest_keeps_its_parameters() -> None:
@@ -438,7 +437,7 @@ def test_a_knock_leaves_the_rest_as_it_is() -> None:
         rows, begin, end = knocked(random, rate, ("push", "tremor", "ring")[k // 2 % 3], size, axes)
         rest, drift = rest_of(random, rate, markov, rows.shape)
         recording = a_recording(rate, *(rest + rows))
-        one = diagnose_record(of_recording(recording, MODEL, 1.0), ["gx"])["gx"]
+        one = diagnose_record(record_from(recording, MODEL, 1.0), ["gx"])["gx"]
         found = identify_axis(recording, "gx", MODEL, "library", None)
         causes = [finding.look.cause for finding in one.findings]
         missed[rate] += causes != ["motion"] or "motion" not in found.judged.checks

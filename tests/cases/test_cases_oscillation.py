@@ -19,7 +19,7 @@ from scipy.stats import binom
 from swings import Swing, plain_ones
 
 from selfcal import _reference
-from selfcal.adequacy.allan import terms_of
+from selfcal.adequacy.allan import allan_terms
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.diagnosis import carried
@@ -126,7 +126,9 @@ def test_allan_variance_of_the_law() -> None:
     """Against sums over the covariance of the readings, of the difference of two means: 1e-9 of it."""
     law = Law((Term("walk"), Term("oscillation", 1.0, 2.0 * math.pi / 45.0, True, True, 0.2)))
     for m in (3, 40, 200):
-        found = float(terms_of(law, {"N": 1e-6, "K": 1e-9, "markov_ratio": 1e6}, 0.5).allan_variance(np.array([m]))[0])
+        found = float(
+            allan_terms(law, {"N": 1e-6, "K": 1e-9, "markov_ratio": 1e6}, 0.5).allan_variance(np.array([m]))[0]
+        )
         w, d = 2.0 * math.pi / 45.0, 0.2
         s = math.sqrt(1.0 - d * d)
         t = 0.5 * np.abs(np.subtract.outer(np.arange(2 * m), np.arange(2 * m)))

@@ -13,9 +13,9 @@ import pytest
 from drifts import noise, recorded
 from scipy.signal import lfilter
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.likelihood import edges
-from selfcal.likelihood.statemodel import Array
 
 from conftest import case_records
 

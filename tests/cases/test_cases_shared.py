@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom, poisson
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis import score
 from selfcal.diagnosis.causes import shared
 from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.record import Record, of_recording
+from selfcal.diagnosis.record import Record, record_from
 from selfcal.likelihood.state import NET_LEAST, P_LOOK, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import Model
 from selfcal.verbs.diagnose import diagnose
 
@@ -240,7 +240,7 @@ def test_the_real_accelerometers_share_noise() -> None:
     """Innovations of ax and ay go together by 0.33 to 0.46 at 1 Hz in all runs, beside a line on both."""
     for run in (1, 2, 4)[: case_records(1, 3)]:
         recording = shared_recording(f"adis16405_run{run}.npz").between(0.0, 4000.0)
-        record = of_recording(recording, Model.load(None), 1.0, ("ax", "ay"))
+        record = record_from(recording, Model.load(None), 1.0, ("ax", "ay"))
         states = {name: record.axes[name].refit() for name in ("ax", "ay")}
         found = {name: Diagnosed(state, state, record) for name, state in states.items()}
         assert shared.CAUSE.grouping.settle is not None

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.causes import periodic, step, variance_change
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import edges
-from selfcal.likelihood.fit import Series, finish, run
+from selfcal.likelihood.fit import Series, fit_at, run
 from selfcal.likelihood.state import Look, State
-from selfcal.likelihood.statemodel import Array, Terms
+from selfcal.likelihood.statemodel import Terms
 from selfcal.verbs.diagnose import diagnose
 
 from conftest import case_records, shared_case
@@ -171,7 +172,7 @@ def test_the_scan_is_the_fit_at_every_place() -> None:
         y = random.standard_normal(n) + 0.05 * random.standard_normal(n).cumsum()
         y[100:130] = y[400] = np.nan
         series = Series(y, 1.0, r, np.vstack([np.ones(n), np.linspace(-1.0, 1.0, n)]))
-        fit = finish(series, terms, np.array(theta))
+        fit = fit_at(series, terms, np.array(theta))
         scan = edges.scan(series, fit)
         for place in (20, 99, 100, 115, 130, 279, 280, 399, 400, 401, 450):
             column = (np.arange(n) >= place).astype(np.float64)

@@ -16,9 +16,9 @@ import yaml
 from drifts import noise, recorded
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis.causes import turn_on
 from selfcal.likelihood.state import Look
-from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import DEFAULT
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from drifts import noise, recorded
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.causes import two_level
 from selfcal.likelihood.edges import scan
-from selfcal.likelihood.statemodel import Array
 
 from conftest import case_records
 

@@ -14,11 +14,11 @@ import pytest
 from scipy.stats import binom, poisson
 
 from selfcal import diagnose
+from selfcal.base.grid import Array
 from selfcal.diagnosis import module
 from selfcal.diagnosis.causes import variance_change
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, P_LOOK, Look, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.model.forms import variance_of
 
 from conftest import case_records

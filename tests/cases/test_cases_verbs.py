@@ -25,14 +25,14 @@ from selfcal.base.errors import UserError
 from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis import diagnose as diagnose_module
 from selfcal.diagnosis import integrity, loop, suspicion
-from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.record import record_from
 from selfcal.likelihood import fit, work
 from selfcal.logs.recording import Column, Recording, load, save
 from selfcal.model.file import Model
 from selfcal.model.regressors import columns_of
 from selfcal.readings import gate
 from selfcal.readings.rest import rest_of
-from selfcal.show.findings import show
+from selfcal.show.diagnosis_lines import show
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -247,7 +247,7 @@ def test_what_is_missing_and_what_the_gate_left_out(seed: int, rate_hz: float, s
                 "missing": own.lost, "moving": own.moving, "not_finite": 0, "saturated": 0, "stuck": 0,
             }  # fmt: skip
         for decimate, axes in ((1.0, ["gx", "ax"]), (None, ["ax"])):
-            record = of_recording(part, Model.load(), decimate, axes)
+            record = record_from(part, Model.load(), decimate, axes)
             looks, _ = integrity.missing(record)
             if not holes:
                 assert not looks and record.present.mean() > 0.99
@@ -522,7 +522,7 @@ def test_work_is_bounded_and_said(
 
 def test_axes_that_stop_raise_in_the_next_pass() -> None:
     """The loop of a record whose work is stopped from the start does not run one round."""
-    record = of_recording(with_gaps(5), Model.load())
+    record = record_from(with_gaps(5), Model.load())
     began = time.monotonic()
     found: dict[str, loop.Diagnosed] = {}
     with work.within(work.Work(lambda: True)), pytest.raises(loop.Stopped):
@@ -570,7 +570,7 @@ def test_a_first_look_that_is_broken_off_says_so(
     save(tmp_path / "log.npz", quiet(16, 10.0, 2100.0, ("gx", "gy")), 10.0)
 
     def stopped_in_the_fit(*_: Any, **__: Any) -> None:
-        ending.Held.came, ending.Held.came_at = signal.SIGINT, time.monotonic()
+        ending.HeldSignals.came, ending.HeldSignals.came_at = signal.SIGINT, time.monotonic()
         raise ending.Stopped
 
     for module, name in ((loop.work, "each"), (loop, "_rounds")):

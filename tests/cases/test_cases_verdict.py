@@ -15,13 +15,13 @@ from scipy.stats import binom, kurtosistest, norm
 
 from selfcal.adequacy.checks import against, kurtosis_at
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
+from selfcal.diagnosis.axis_verdict import coherence, joined_looks, look_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
-from selfcal.diagnosis.record import LEAST, Record
+from selfcal.diagnosis.record import FEWEST, Record
 from selfcal.diagnosis.statistics import Statistic, judged
-from selfcal.diagnosis.verdict import coherence, joined, look_of
 from selfcal.likelihood.state import NET_LEAST, Look, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import LARGEST, SMALLEST, Model
 from selfcal.readings.budget import CHECK_LIMIT, OF_MODULES, SHARES
 from selfcal.show import pictures
@@ -150,18 +150,18 @@ def test_neither_look_overrules_the_other() -> None:
     sure = Look("ramp", 30.0, 30.0, {}, {"regressors": ()})
     weak = Look("ramp", NET_LEAST + 0.1, NET_LEAST + 0.1, {}, {"regressors": ()})
     none, found = result(random, None), result(random, sure)
-    assert joined(none, found, "stopped") is found
-    assert joined(found, none, "stopped") is found
-    assert joined(none, none, "stopped") is none
+    assert joined_looks(none, found, "stopped") is found
+    assert joined_looks(found, none, "stopped") is found
+    assert joined_looks(none, none, "stopped") is none
     # Two looks cost ln 2.
-    assert joined(none, result(random, weak), "stopped") is none
-    assert joined(result(random, weak), none, "stopped") is not none
+    assert joined_looks(none, result(random, weak), "stopped") is none
+    assert joined_looks(result(random, weak), none, "stopped") is not none
     cut = result(random, None, "stopped")
-    told = joined(cut, found, "stopped")
+    told = joined_looks(cut, found, "stopped")
     assert told is not None
     assert told.findings == found.findings
     assert told.unfinished == "every sample: stopped"
-    assert joined(cut, None, "stopped") is None
+    assert joined_looks(cut, None, "stopped") is None
 
 
 def test_the_allan_deviation_is_the_picture_of_its_statistic() -> None:
@@ -196,7 +196,7 @@ def test_a_dead_band_is_shown(kind: str, tmp_path: Path) -> None:
                 if abs(y[k] - y[k - 1]) < width:
                     y[k] = y[k - 1]
         log = log_of(tmp_path / "dead.npz", 0.04 * y, 1.0)
-        if kind == "held" and np.count_nonzero(np.diff(y)) < LEAST:
+        if kind == "held" and np.count_nonzero(np.diff(y)) < FEWEST:
             with pytest.raises(UserError, match="of its readings neither stick nor are clipped"):
                 diagnose(log)
             continue

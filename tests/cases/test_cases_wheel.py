@@ -106,7 +106,7 @@ for name in ("default", "sums"):
     noise = np.random.default_rng(3).normal(size=(2, 4000, 2))
     bank.push(0.02 * noise[0] + 1e-3 * np.cumsum(noise[1], axis=0))
     print(_library32.__name__, hashlib.sha256(bank.raw.save()).hexdigest(), bank.report(0), bank.report(1))
-from selfcal.likelihood.fit import Series, finish, passed, shifts, slopes
+from selfcal.likelihood.fit import Series, fit_at, passed, shifts, slopes
 from selfcal.likelihood.statemodel import Terms
 noise = np.random.default_rng(4).normal(size=(3, 1500))
 y = noise[0] + 0.1 * np.cumsum(noise[1])
@@ -119,7 +119,7 @@ for terms in some:
     theta = np.array(terms.limits(0.5)).mean(axis=1) + 0.1
     numbers = [*passed(series, terms, theta, [700, 1500], True)]
     found = shifts(series, terms, theta)
-    numbers += [found.A, found.B, found.impulse, *slopes(series, finish(series, terms, theta))]
+    numbers += [found.A, found.B, found.impulse, *slopes(series, fit_at(series, terms, theta))]
     print(_likelihood.__name__, hashlib.sha256(b"".join(one.tobytes() for one in numbers)).hexdigest())
 from selfcal.likelihood.joint import Joint, course, information
 own = np.tile([0.1, -4.0, -1.5, -4.0], (6, 1)) + 0.1 * np.arange(6.0)[:, None]

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from selfcal import _library32, _reference
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult
 from selfcal.model.file import DEFAULT, Model, Regressor
 from selfcal.model.laws import NAMED, PLACES, SUMS
 from selfcal.model.tables import Tables, make_grid, make_tables
@@ -166,7 +166,7 @@ def a_record(
     group = model_of(law).group_of("gx")
     rng = np.random.default_rng([n, seed, list(NAMED).index(law), columns])
     if rho is None:
-        truth = draw(group, law, rng)
+        truth = draw_parameters(group, law, rng)
     else:
         truth = {name: math.sqrt(group.priors[name].min * group.priors[name].max) for name in NAMED[law].parameters}
         truth |= {"N": 1e-3 if rho > 0.1 else 0.1, "bias": 0.0}

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import binom
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array
 
 N, K, SIGMA_M, TIME_S = 0.04, 3e-4, 0.012, 250.0
 LAWS = ("walk", "markov")

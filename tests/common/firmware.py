@@ -17,7 +17,7 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from selfcal.model.file import PARTS, Model
+from selfcal.model.file import PARTS_FOLDER, Model
 from selfcal.verbs.codegen import codegen
 from selfcal.wire.frames import AxisReport, Decoder
 
@@ -88,7 +88,7 @@ def image(
         model = Model.load().path
         if sensor != image_sizes.SENSOR:
             own = "/" in sensor  # a driver elsewhere, with its model file beside it
-            room, driver = (Path(sensor).parent, Path(sensor).stem) if own else (PARTS, sensor)
+            room, driver = (Path(sensor).parent, Path(sensor).stem) if own else (PARTS_FOLDER, sensor)
             [model] = room.glob(f"{driver}*.yaml")
         document = yaml.safe_load(model.read_text())
         if quiet:

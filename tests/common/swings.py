@@ -10,10 +10,10 @@ import numpy as np
 from drifts import LAWS, noise, recorded
 from scipy.signal import lfilter
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.fit import finish
+from selfcal.likelihood.fit import fit_at
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array
 
 #: Steps of the difference equation: in a period, and between two readings.
 IN_PERIOD, IN_READING = 400, 4
@@ -55,7 +55,7 @@ class Swing:
                     math.log(self.sd / one.sigma) if name == "ln_swing" else own.get(name, 0.0) or small.value(name)
                     for name in terms.names
                 ]
-                values.append(finish(state.series, terms, np.array(theta)).ln_likelihood)
+                values.append(fit_at(state.series, terms, np.array(theta)).ln_likelihood)
         return max(values) - state.best.ln_likelihood
 
 

@@ -5,8 +5,8 @@
 Truth: white noise and one drift law an axis, nothing else. Each form has a quarter of the records: float64; readings on
 a lattice of a quarter of the noise; text with eight significant digits; the same with means of ten readings.
 
-- Readings: the tests of `readings/tests.py` name 2 in 1000 sound axes at most. Each test is run with 20 times its share
-  as well, and names no more axes than a binomial count exceeds in 1 of 1000 runs.
+- Readings: `readings/faults.py` names 2 in 1000 sound axes at most. Each fault is looked for with 20 times its share as
+  well, and named on no more axes than a binomial count exceeds in 1 of 1000 runs.
 - Causes and verdict: 2 in 100 modules have a finding. `identify` looks at all records, `diagnose` at every fifth one,
   both at 20 times their shares as well; then each check of `identify` keeps to its own.
 
@@ -132,14 +132,14 @@ def of_tests(seed: int, rate: float) -> Wrong:
     def look_at(path: Path) -> Wrong:
         from selfcal.logs.recording import load
         from selfcal.model.file import Model
+        from selfcal.readings.faults import FAULTS
         from selfcal.readings.readings import look
-        from selfcal.readings.tests import TESTS
 
         recording, model = load(path), Model.load(None)
         named = {}
         for name in AXES:
             readings = look(recording, name, model.group_of(name))
-            named[name] = [test.name for test in TESTS if test.statistic(readings) > 0.0]
+            named[name] = [fault.name for fault in FAULTS if fault.statistic(readings) > 0.0]
         return {name: tests for name, tests in named.items() if tests}
 
     return _of_log(look_at, seed, rate)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from selfcal.diagnosis.module import NULL, Search, in_means
-from selfcal.likelihood.joint import bins_of, fitted
+from selfcal.likelihood.joint import bins_of, fit_joint
 
 Array = NDArray[np.float64]
 #: Drift over white noise at 1 s, of a walk a step and of a Gauss-Markov process; of each octave of 1/f noise.
@@ -55,7 +55,7 @@ def best(seed: int) -> dict[str, float]:
     n = int(random.uniform(1800, 10800))
     y, kept_out, _ = in_means(np.array([axis(random, n) for _ in range(6)]))
     side = {name: markov(random, n, 600.0) for name in ("temperature", "supply")}
-    known = Search(1.0, side, kept_out, 0.0, fitted(bins_of(y), 1.0, False), y).known
+    known = Search(1.0, side, kept_out, 0.0, fit_joint(bins_of(y), 1.0, False), y).known
     return {name: max((column.evidence for column in columns), default=-np.inf) for name, columns in known.items()}
 
 

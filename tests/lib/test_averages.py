@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from selfcal import _reference
-from selfcal.adequacy.allan import terms_of
+from selfcal.adequacy.allan import allan_terms
 from selfcal.bank.library import Bank
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.laws import Law, averaged, lost_of
@@ -245,7 +245,7 @@ def test_the_textbook_bank_averages_sample_by_sample(law: str, lost: bool) -> No
 def test_the_allan_variance_is_that_of_averaged_samples(law: str) -> None:
     dt, block, n, of = 1.0, 5, 40, GROUP.laws[law]
     truth = Dense.of(of, 0.05, 0.03, SECOND[law], dt, block, n).covariance
-    terms = terms_of(of, dict(zip(of.parameters, (0.05, 0.03, SECOND[law]), strict=False)), dt, block)
+    terms = allan_terms(of, dict(zip(of.parameters, (0.05, 0.03, SECOND[law]), strict=False)), dt, block)
     for m in (1, 2, 7):
         weights = np.zeros(n)
         weights[n - 2 * m : n - m], weights[n - m :] = -1.0 / m, 1.0 / m

@@ -20,8 +20,8 @@ from tumbled import G0, POSITIONS, draw_part, matrices
 
 from selfcal.calibration import accelerometer
 from selfcal.calibration.earth import Place
-from selfcal.calibration.noise import Noise, Term, drift
-from selfcal.calibration.rests import ACCEL, GYRO, PIECES, Rest, Tumble
+from selfcal.calibration.noise import DriftTerm, Noise, drift
+from selfcal.calibration.tumble_rests import ACCEL, GYRO, REST_PIECES, Rest, Tumble
 
 from conftest import ROOT
 
@@ -79,7 +79,7 @@ class Drawn:
 
     def noise_of(self, axis: int) -> Noise:
         N, K, sigma_m, alpha = (float(one) for one in self.noise[axis])
-        return Noise(N**2, (Term(K**2), Term(sigma_m**2, alpha)), "")
+        return Noise(N**2, (DriftTerm(K**2), DriftTerm(sigma_m**2, alpha)), "")
 
 
 def drawn(positions: int, seed: int) -> Drawn:
@@ -128,7 +128,7 @@ def on_the_host(one: Drawn) -> accelerometer.Accelerometer:
     """The same means by the host's fit, without temperature, rounding or an error of gravity."""
     none = np.zeros(6)
     rests = tuple(
-        Rest(0, (begin, end), begin, end, end - begin, mean[:3], mean[3:], math.nan, none, np.zeros((PIECES, 6)))
+        Rest(0, (begin, end), begin, end, end - begin, mean[:3], mean[3:], math.nan, none, np.zeros((REST_PIECES, 6)))
         for mean, begin, end in zip(
             one.mean.astype(float), one.begin_s.astype(float), one.end_s.astype(float), strict=True
         )

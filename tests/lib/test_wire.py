@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from selfcal import _firmware
 from selfcal.base.errors import UserError
 from selfcal.wire import frames_codegen
-from selfcal.wire.dbc_file import Names, dbc
+from selfcal.wire.dbc_file import Names, dbc_text
 from selfcal.wire.frames import AXES, AxisReport, Decoder, Statistics, Streams, frame_crc, load_dbc, open_bus
 
 from wire_stream import ROOT, Sent, lines, message, serial_line, stream
@@ -58,7 +58,7 @@ def changed_dbc(old: str, new: str) -> cantools.database.can.Database:
 
 def test_committed_files_are_the_generated_ones() -> None:
     """`python -m selfcal.wire.frames_codegen` writes them."""
-    assert DBC.read_text() == dbc()
+    assert DBC.read_text() == dbc_text()
     assert (ROOT / "lib" / "selfcal_frames.h").read_text() == frames_codegen.header(load_dbc())
     wire = (ROOT / "lib" / "WIRE.md").read_text(encoding="utf-8")
     assert wire == frames_codegen.page(wire, load_dbc())
@@ -71,7 +71,7 @@ def test_names_of_a_model_are_symbols_of_a_dbc() -> None:
         (("N",), ("N", "K"), ("N", "B", "alpha")),
         (("temperature.sin", "degC"), ("temperature_sin", "degC"), ("ax", "m/s^2")),
     )
-    database = cantools.database.load_string(dbc(11, names, ("gy", "az")), "dbc")
+    database = cantools.database.load_string(dbc_text(11, names, ("gy", "az")), "dbc")
     for entry in database.messages:
         assert re.fullmatch(r"M11_[A-Z]\w{0,27}", entry.name, re.ASCII)
         symbols = [signal.name for signal in entry.signals]
@@ -190,7 +190,7 @@ def test_cantools_reads_every_item_that_c_packs(hypotheses: int, columns: int) -
 
 def test_a_dbc_with_a_model_s_names_reads_the_frames_of_its_node() -> None:
     """Node 5, whose identifiers are 5 * 128 higher; names and units of NAMES in place of the places'."""
-    database = cantools.database.load_string(dbc(5, NAMES), "dbc")
+    database = cantools.database.load_string(dbc_text(5, NAMES), "dbc")
     for sent in stream(7, 2, columns=6, node=5):
         decoded: dict[str, float] = {}
         for line in sent.lines:

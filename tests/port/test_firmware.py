@@ -19,7 +19,7 @@ from firmware import AXES, QUIET_RATE_HZ, SLOW_RATE_HZ, Board, Tap, image, repor
 from gated import Gated
 
 from selfcal.model.file import Model
-from selfcal.wire.frames import names_of
+from selfcal.wire.frames import wire_names
 
 P_TOLERANCE, NAT_TOLERANCE, SD_TOLERANCE = 1e-4, 0.01, 0.02
 STATUS_FRAMES = 46
@@ -64,7 +64,7 @@ def test_telemetry_on_the_bus_equals_the_host() -> None:
             missing, sample = tap.seen[fed]
             host.feed(missing, np.array(sample, dtype=np.float32))
             fed += 1
-        got, want = report.result(names_of(Model.load())), bank.report(AXES.index(name))
+        got, want = report.result(wire_names(Model.load())), bank.report(AXES.index(name))
         assert got.n == want.n >= 3
         best = max(got.log_evidence.values()), max(want.log_evidence.values())
         assert abs(got.bias_mean - want.bias_mean) <= SD_TOLERANCE * want.bias_sd

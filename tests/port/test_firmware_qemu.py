@@ -27,8 +27,8 @@ from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Model
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
-from selfcal.wire.frames import ROOT, AxisReport, axis_unit, load_dbc, names_of
-from selfcal.wire.replay import TARGETS, build, emulator, run, write_rows
+from selfcal.wire.frames import ROOT, AxisReport, axis_unit, load_dbc, wire_names
+from selfcal.wire.replay import TARGETS, build, emulator, run_firmware, write_rows
 
 from conftest import shared_recording
 
@@ -101,7 +101,7 @@ def test_the_core_computes_what_the_host_computes(core: str, tmp_path: Path) -> 
     history = {}
     for target in ("host", core):
         firmware = program(model, recording.rate_hz, axes, target, core, tmp_path, flags)
-        history[target], _ = run(firmware, recording, model, axes, every, target, gate=core == "cortex-m4f")
+        history[target], _ = run_firmware(firmware, recording, model, axes, every, target, gate=core == "cortex-m4f")
     assert [len(history[core][axis]) for axis in axes] == [600.0 / every] * len(axes)
     assert values(history[core]) == values(history["host"])
 
@@ -134,7 +134,7 @@ def test_the_c_library_changes_nothing_that_matters(core: str, tmp_path: Path) -
     recording = part(tmp_path, 600.0, axes)
     flags = "-DSELFCAL_MODEL_JUDGED=0" if core == "cortex-m0" else ""
     made = {target: program(model, recording.rate_hz, axes, target, core, tmp_path, flags) for target in ("host", core)}
-    history = {target: run(one, recording, model, axes, 600.0, target)[0] for target, one in made.items()}
+    history = {target: run_firmware(one, recording, model, axes, 600.0, target)[0] for target, one in made.items()}
     assert_close(history[core], history["host"])
 
 
@@ -219,7 +219,7 @@ def test_the_firmware_says_what_is_wrong_with_its_rows(  # type: ignore[no-untyp
 
     monkeypatch.setattr("selfcal.wire.replay.write_rows", damaged)
     with pytest.raises(UserError, match=complaint):
-        run(build(model, recording.rate_hz, axes, "cortex-m4f"), recording, model, axes, 10.0, "cortex-m4f")
+        run_firmware(build(model, recording.rate_hz, axes, "cortex-m4f"), recording, model, axes, 10.0, "cortex-m4f")
 
 
 def test_an_emulator_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,7 +227,7 @@ def test_an_emulator_that_is_not_there(tmp_path: Path, monkeypatch: pytest.Monke
     firmware = build(model, recording.rate_hz, ("gz",), "cortex-m4f")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match=r"cannot run the firmware: qemu-system-arm: No such file"):
-        run(firmware, recording, model, ("gz",), None, "cortex-m4f")
+        run_firmware(firmware, recording, model, ("gz",), None, "cortex-m4f")
 
 
 @pytest.mark.skipif("SELFCAL_EMULATE" not in os.environ, reason="minutes: make emulate")
@@ -251,7 +251,7 @@ def test_twenty_minutes_of_six_axes(core: str, name: str, tmp_path: Path) -> Non
         recording = load(tmp_path / "part.npz")
     model = Model.load()
     history = {
-        target: run(
+        target: run_firmware(
             program(model, recording.rate_hz, SIX, target, core, tmp_path), recording, model, SIX, 1200.0, target
         )[0]
         for target in ("host", core)
@@ -260,7 +260,7 @@ def test_twenty_minutes_of_six_axes(core: str, name: str, tmp_path: Path) -> Non
     worst_p = worst_mean = worst_sd = 0.0
     for axis in SIX:
         truth = identify_axis(recording, axis, model, "reference", None).result
-        found = history[core][axis][-1].result(names_of(model))
+        found = history[core][axis][-1].result(wire_names(model))
         worst_p = max(worst_p, *(abs(found.probability[law] - p) for law, p in truth.probability.items()))
         print(axis, " ".join(f"{law} {found.probability[law]:.4f} ({p:.4f})" for law, p in truth.probability.items()))
         for law, parameters in truth.parameters.items():

@@ -20,7 +20,7 @@ from selfcal.logs.recording import load
 from selfcal.model.file import Model
 from selfcal.verbs.replay import replay
 from selfcal.wire.frames import AXES, REASONS, choices, reasons
-from selfcal.wire.replay import build, run
+from selfcal.wire.replay import build, run_firmware
 
 RATE_HZ = 10.0
 #: White noise of 0.04 deg/s/sqrt(Hz) and 1e-3 m/s^2/sqrt(Hz), within the default model's priors; sd of a reading.
@@ -38,7 +38,7 @@ def told(tmp_path: Path, readings: Readings, *, every: float | None = None, gate
     columns = {axis: (SENSOR_UNITS[axis], values) for axis, values in readings.items()}
     recording_module.save(tmp_path / "log.npz", columns, RATE_HZ, {})
     recording, model, axes = load(tmp_path / "log.npz"), Model.load(), tuple(readings)
-    return run(build(model, RATE_HZ, axes), recording, model, axes, every, gate=gate)[1]
+    return run_firmware(build(model, RATE_HZ, axes), recording, model, axes, every, gate=gate)[1]
 
 
 def test_every_word_has_its_meaning_and_next_step() -> None:

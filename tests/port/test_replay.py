@@ -26,10 +26,10 @@ from selfcal.logs import recording as recording_module
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Model
 from selfcal.model.tables import make_tables
-from selfcal.show import plot as plot_module
+from selfcal.show import run_plot as plot_module
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay
-from selfcal.wire.replay import build, run, write_rows
+from selfcal.wire.replay import build, run_firmware, write_rows
 
 from conftest import run as started
 from conftest import shared_recording
@@ -228,7 +228,7 @@ def test_reports_come_when_asked_for(tmp_path: Path) -> None:
     recording = load(part_of_shipped(tmp_path / "part.csv.gz", 330.0))
     model = Model.load()
     axes = ("gx", "az")
-    history, _ = run(build(model, recording.rate_hz, axes), recording, model, axes, 60.0)
+    history, _ = run_firmware(build(model, recording.rate_hz, axes), recording, model, axes, 60.0)
     for name in axes:
         # the sample before the gap of 7 s that begins at 300 s comes at 300.0 s on the clock; the end is at 330 s
         assert [report.time_s for report in history[name]] == [60.0, 120.0, 180.0, 240.0, 300.0, 330.0]

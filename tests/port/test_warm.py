@@ -20,10 +20,10 @@ import yaml
 from scipy import stats
 from warm_start import LAW, PART, both, campaign, diagnosed, law_known
 
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
-from selfcal.bank.result import HALF_90
 from selfcal.base.errors import UserError
-from selfcal.diagnosis.warm import REACH, RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, WIDENED, load, warmed
+from selfcal.diagnosis.warm import PRIOR_REACH, RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, WIDENED, load_start, warmed
 from selfcal.logs.recording import load as load_recording
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.regressors import columns_of
@@ -63,7 +63,7 @@ def test_the_prior_is_the_posterior_widened(files: Files) -> None:
             sd = math.hypot(math.log(told["q95"] / told["q05"]) / (2.0 * HALF_90), RUN_TO_RUN[name])
             assert measured
             assert (low, high) == pytest.approx(
-                (math.log(told["median"]) - REACH * sd, math.log(told["median"]) + REACH * sd)
+                (math.log(told["median"]) - PRIOR_REACH * sd, math.log(told["median"]) + PRIOR_REACH * sd)
             )
         assert (h.rho, h.alpha, h.ln_probability) == (cold.rho, cold.alpha, cold.ln_probability)
     one = posterior["regressors"]["temperature"]["coefficients"]["temperature"]
@@ -78,7 +78,7 @@ def test_the_prior_is_the_posterior_widened(files: Files) -> None:
         assert row[place][0] < math.log(PART[name]) < row[place][1]
     assert abs(column.coefficient_mean[0] - PART["coefficient"]) < 4.0 * column.coefficient_sd[0]
     # axes that were not diagnosed keep the model's priors
-    all_axes = warmed(make_tables(model, 1.0), load(files[1], model))
+    all_axes = warmed(make_tables(model, 1.0), load_start(files[1], model))
     assert all_axes.regressors[0].coefficient_mean[1:] == (0.0,) * 5
     assert all_axes.hypotheses[0].priors[1][0][3] is False
 
@@ -165,7 +165,7 @@ def test_the_firmware_starts_warm(target: str, files: Files, short: Path) -> Non
     module's report integrates more coarsely. The axis counts as identified; from a cold start it does not."""
     model = Model.load(files[0])
     recording = load_recording(short)
-    tables = warmed(make_tables(model, recording.rate_hz, ("gx",)), load(files[1], model))
+    tables = warmed(make_tables(model, recording.rate_hz, ("gx",)), load_start(files[1], model))
     bank = Bank(tables)
     samples = recording.in_unit("gx", "deg/s").astype(np.float32)
     bank.push(samples[:, None], recording.missing_before, columns_of(model.regressors, recording))
@@ -255,5 +255,5 @@ def test_another_file_is_refused_in_one_line(
 def test_what_is_no_json_is_refused_in_one_line(text: bytes, files: Files, tmp_path: Path) -> None:
     (tmp_path / "bad.json").write_bytes(text)
     with pytest.raises(UserError, match="not a diagnosis") as error:
-        load(tmp_path / "bad.json", Model.load(files[0]))
+        load_start(tmp_path / "bad.json", Model.load(files[0]))
     assert "\n" not in str(error.value)

@@ -10,7 +10,7 @@ import pytest
 
 from selfcal.logs.recording import Column, Recording
 from selfcal.model.file import Model, Regressor
-from selfcal.wire.ahead import AHEAD_S, Known, error_ahead, of_report
+from selfcal.wire.ahead import AHEAD_S, KnownBias, error_ahead, of_report
 from selfcal.wire.frames import AxisReport
 
 RATE_HZ, SLOPE = 2.0, 1.0e-3
@@ -26,7 +26,7 @@ def recorded(minutes: int) -> Recording:
     return Recording(Path("a"), RATE_HZ, {"gx": Column("gx", "rad/s", readings)}, missing, {})
 
 
-def reports(times: tuple[float, ...], model: Model = MODEL, **more: float) -> list[Known]:
+def reports(times: tuple[float, ...], model: Model = MODEL, **more: float) -> list[KnownBias]:
     """Each knows the bias of its time."""
     told = (AxisReport("gx", time, True, {"bias_mean": 0.5 + SLOPE * time, **more}) for time in times)
     return [of_report(one, model) for one in told]

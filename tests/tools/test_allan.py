@@ -19,24 +19,24 @@ import pytest
 from scipy.stats import chi2, norm
 
 from selfcal.adequacy.allan import (
+    allan_terms,
     deviations,
     freedom_of,
     lengths,
-    overlapping,
+    overlapping_variance,
     ratio_at,
     relative_variance,
     sample_lengths,
     sampled,
-    terms_of,
 )
-from selfcal.adequacy.checks import judge
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
-from selfcal.bank.blocks import block_means
+from selfcal.adequacy.checks import judge_record
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
+from selfcal.bank.blocks import blocks_of
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import as_float, save
 from selfcal.model.file import Model
-from selfcal.model.laws import PLAIN, named
+from selfcal.model.laws import PLAIN, named_law
 from selfcal.model.tables import make_tables
 from selfcal.readings.budget import CHECK_LIMIT
 from selfcal.show.identification import show
@@ -64,7 +64,7 @@ def test_closed_forms_are_those_of_the_simulator(law: str) -> None:
     longest, which is not normal."""
     n, at = 1000, (1, 2, 5, 20, 100)
     stated = {"correlation_time_s": 100.0} if law == "walk_and_markov" else {}
-    terms = terms_of(named(law, 100.0), CASES[law], 1.0)
+    terms = allan_terms(named_law(law, 100.0), CASES[law], 1.0)
     found = np.empty((2, 150, len(at)))
     windows = {}
     for seed in range(300):
@@ -72,7 +72,7 @@ def test_closed_forms_are_those_of_the_simulator(law: str) -> None:
         if seed % 2:
             y = np.where(np.isin(np.arange(n), [*range(300, 330), 777]), np.nan, y)
         for k, m in enumerate(at):
-            found[seed % 2, seed // 2, k], windows[seed % 2, m] = overlapping(y, m)
+            found[seed % 2, seed // 2, k], windows[seed % 2, m] = overlapping_variance(y, m)
     expected = terms.allan_variance(np.array(at, float))
     for gaps in (0, 1):
         sd = expected * np.sqrt([relative_variance(terms, m, windows[gaps, m]) for m in at])
@@ -87,15 +87,15 @@ def test_closed_forms_are_the_literatures() -> None:
     mean."""
     m = np.array([200.0, 2000.0, 20000.0])
     tau = 0.01 * m
-    assert terms_of(named("constant"), {"N": 0.3}, 0.01).allan_variance(m) == pytest.approx(0.09 / tau, rel=1e-9)
-    walk = terms_of(named("random_walk"), {"N": 1e-9, "K": 0.2}, 0.01).allan_variance(m)
+    assert allan_terms(named_law("constant"), {"N": 0.3}, 0.01).allan_variance(m) == pytest.approx(0.09 / tau, rel=1e-9)
+    walk = allan_terms(named_law("random_walk"), {"N": 1e-9, "K": 0.2}, 0.01).allan_variance(m)
     assert walk == pytest.approx(0.04 * tau / 3.0, rel=1e-4)
     q = 0.05 * tau
-    markov = terms_of(named("gauss_markov"), {"N": 1e-9, "sigma_m": 2.0, "alpha": 0.05}, 0.01).allan_variance(m)
+    markov = allan_terms(named_law("gauss_markov"), {"N": 1e-9, "sigma_m": 2.0, "alpha": 0.05}, 0.01).allan_variance(m)
     closed = 4.0 * 2.0 / q * (1.0 - (3.0 - 4.0 * np.exp(-q) + np.exp(-2.0 * q)) / (2.0 * q))
     assert markov == pytest.approx(closed, rel=1e-4)
     between = np.geomspace(300.0, 48000.0, 20).round()
-    flicker = terms_of(named("flicker"), {"N": 1e-9, "B": 1.0, "alpha": 0.05}, 0.01).allan_variance(between)
+    flicker = allan_terms(named_law("flicker"), {"N": 1e-9, "B": 1.0, "alpha": 0.05}, 0.01).allan_variance(between)
     assert np.sqrt(flicker) == pytest.approx(0.664, rel=0.04)
     assert np.exp(np.log(flicker).mean() / 2.0) == pytest.approx(0.664, rel=0.01)
 
@@ -122,12 +122,12 @@ def test_false_alarms_are_as_many_as_stated(half_life_s: float, n: int, records:
     tables = make_tables(model, 1.0, ("gx",))
     for index, law in enumerate(PLAIN):
         for seed in range(records):
-            truth = draw(GROUP, law, np.random.default_rng([seed, index]))
+            truth = draw_parameters(GROUP, law, np.random.default_rng([seed, index]))
             y, _ = simulate_bank_samples(law, {**truth, "bias": 0.3}, 1.0, n, 1000 * index + seed)
             bank = Bank(tables)
             bank.push(y[:, None])
-            blocks = block_means(y, np.zeros(n, np.int64), 1, GROUP)
-            judged = judge(blocks, tables, GROUP, bank.report(0))
+            blocks = blocks_of(y, np.zeros(n, np.int64), 1, GROUP)
+            judged = judge_record(blocks, tables, GROUP, bank.report(0))
             checks = {name: check for name, check in judged.checks.items() if name.startswith("allan_")}
             assert list(checks) == [f"allan_{tau}s" for tau in (2, 4, 8, 16, 32, 64)]
             assert all(check["passed"] for check in checks.values()), (law, seed, checks)
@@ -167,7 +167,7 @@ def test_gaps_part_the_curve_of_the_samples() -> None:
     even[np.arange(4000) + np.cumsum(missing)] = y
     m = sample_lengths(4000, 10)
     curve = sampled(y, missing, 10.0, m)
-    expected = [math.sqrt(overlapping(even, int(length))[0]) for length in np.rint(curve.tau_s * 10.0)]
+    expected = [math.sqrt(overlapping_variance(even, int(length))[0]) for length in np.rint(curve.tau_s * 10.0)]
     assert curve.tau_s[0] == 0.1
     assert curve.tau_s[-1] == 32.0  # two windows of it and more fit between the gaps
     assert curve.deviation == pytest.approx(expected, rel=1e-9)

@@ -282,8 +282,8 @@ def test_an_import_that_swallows_everything_swallows_no_end(tmp_path: Path) -> N
         "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGTERM)\n    import email.mime\nexcept:\n    pass\n"
     )
     program = (
-        "import sys, time\nfrom selfcal.base.ending import Ended, install, last_signal\n"
-        f"install()\nsys.path.insert(0, {str(tmp_path)!r})\n"
+        "import sys, time\nfrom selfcal.base.ending import Ended, install_signals, last_signal\n"
+        f"install_signals()\nsys.path.insert(0, {str(tmp_path)!r})\n"
         "try:\n    import swallows\n    time.sleep(30)\nexcept Ended:\n    sys.exit(last_signal())\n"
     )
     assert subprocess.run([sys.executable, "-c", program], check=False, timeout=20).returncode == 128 + signal.SIGTERM

@@ -15,7 +15,7 @@ from test_page import HOSTILE, Page
 from selfcal.base.errors import UserError
 from selfcal.batch.compare import changes, show
 from selfcal.logs.recording import save
-from selfcal.show.comparison_page import page, told_of
+from selfcal.show.comparison_page import comparison_html, told_of
 from selfcal.verbs.compare import compare
 
 
@@ -120,9 +120,9 @@ def test_nothing_in_it_runs_or_is_loaded(made: tuple[dict[str, Any], str]) -> No
 def test_without_a_change_it_states_so(made: tuple[dict[str, Any], str]) -> None:
     document, _ = made
     quiet = {**document, "axes": {"ax": []}}
-    assert "nothing changed beyond what the recordings leave open" in page(quiet, {})
+    assert "nothing changed beyond what the recordings leave open" in comparison_html(quiet, {})
     missing = {**document, "axes": {"gx": {"error": "b.npz does not have it", "changes": []}}}
-    assert "gx not compared: b.npz does not have it" in Page(page(missing, {})).text
+    assert "gx not compared: b.npz does not have it" in Page(comparison_html(missing, {})).text
 
 
 def test_the_terminal_tells_what_each_recording_shows(
@@ -160,7 +160,7 @@ def test_each_pair_of_three_has_its_own_list(capsys: pytest.CaptureFixture[str])
     between = shown.index("two.csv -> three.csv")
     assert shown.index("one.csv -> two.csv") < shown.index("turn-on transient 2") < shown.index("0.05") < between
     assert "turn-on transient 2" in shown[between:] and "turn_on" not in shown
-    seen = Page(page({**document, "verdicts": {log: {} for log in logs}, "quantities": {}}, {})).text
+    seen = Page(comparison_html({**document, "verdicts": {log: {} for log in logs}, "quantities": {}}, {})).text
     assert "one.csv → two.csv" in seen and "turn-on transient 2" in seen and "turn on" not in seen
 
 

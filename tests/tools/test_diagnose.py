@@ -20,20 +20,20 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from selfcal.base.ending import Held
+from selfcal.base.ending import HeldSignals
 from selfcal.base.errors import UserError
 from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import _looked
 from selfcal.diagnosis.record import Record as OfAxes
-from selfcal.diagnosis.swing import MOST as BANDS_MOST
+from selfcal.diagnosis.swing import SWINGS_MOST as BANDS_MOST
 from selfcal.likelihood.fit import (
     COLUMNS_MOST,
     Fit,
     Series,
-    finish,
     fit,
+    fit_at,
     ln_likelihood,
     shifts,
     slopes,
@@ -43,7 +43,7 @@ from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array, Terms, matrices
 from selfcal.logs.recording import load, save
 from selfcal.model.file import DEFAULT, Model
-from selfcal.readings.motion import moves_of
+from selfcal.readings.moves import moves_of
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -265,9 +265,9 @@ def test_slopes_are_those_of_the_likelihood(terms: Terms, at: list[float]) -> No
 
     ln likelihood has errors of 1e-6 where the filter keeps its gain: 1e-3 in these differences."""
     series, theta = uneven(3000, np.random.default_rng(5)), np.array(at)
-    slope, information = slopes(series, finish(series, terms, theta))
+    slope, information = slopes(series, fit_at(series, terms, theta))
     moves = 1e-3 * np.eye(theta.size)
-    around = [[finish(series, terms, theta + sign * move).ln_likelihood for sign in (1.0, -1.0)] for move in moves]
+    around = [[fit_at(series, terms, theta + sign * move).ln_likelihood for sign in (1.0, -1.0)] for move in moves]
     assert slope == pytest.approx([(ahead - back) / 2e-3 for ahead, back in around], rel=1e-4, abs=2e-2)
     assert (np.linalg.eigvalsh(information) > 0.0).all()
 
@@ -281,7 +281,7 @@ def test_no_likelier_parameters_than_the_fitted_ones(terms: Terms, at: list[floa
     limits = terms.limits(series.dt)
 
     def cost(theta: np.ndarray) -> float:
-        return -finish(series, terms, np.clip(theta, *np.transpose(limits))).ln_likelihood
+        return -fit_at(series, terms, np.clip(theta, *np.transpose(limits))).ln_likelihood
 
     best = min(minimize(cost, start, method="Nelder-Mead", bounds=limits).fun for start in (found.theta, np.array(at)))
     assert found.ln_likelihood > -best - 0.05
@@ -738,7 +738,7 @@ def test_an_end_while_results_are_written_loses_none(tmp_path: Path, monkeypatch
     values = 0.1 * np.random.default_rng(7).standard_normal((2, 1500))
     values[:, 700:] += [[0.5], [0.3]]
     save(tmp_path / "log.npz", {name: ("deg/s", row) for name, row in zip(("gx", "gy"), values, strict=True)}, 1.0)
-    monkeypatch.setattr(Held, "overdue", property(lambda held: True))
+    monkeypatch.setattr(HeldSignals, "overdue", property(lambda held: True))
     document = diagnose(tmp_path / "log.npz", write_model=tmp_path / "extended.yaml")
     assert [(entry["cause"], list(entry["axes"])) for entry in document["findings"]] == [("step", ["gx", "gy"])]
     assert Model.load(tmp_path / "extended.yaml").regressors[0].kind == "step"

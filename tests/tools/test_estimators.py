@@ -11,8 +11,17 @@ from influences import Drawn, other_axis
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from selfcal.diagnosis.estimators import METHODS, armax, arx, beside, box_jenkins, correlation, instruments, subspace
-from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.estimators import (
+    METHODS,
+    armax,
+    arx,
+    box_jenkins,
+    correlation,
+    instruments,
+    methods_beside,
+    subspace,
+)
+from selfcal.diagnosis.record import record_from
 from selfcal.diagnosis.transfer import late
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
@@ -134,12 +143,12 @@ def test_an_answer_is_explained_or_not(tmp_path: Path) -> None:
         drawn = Drawn(seed)
         other_axis(drawn)
         model = Model.load(None)
-        record = of_recording(load(drawn.write(tmp_path / "log.npz")), model, None, ("gx", "gy"))
+        record = record_from(load(drawn.write(tmp_path / "log.npz")), model, None, ("gx", "gy"))
         u = record.axes["gy"].y
         state = record.axes["gx"]
         _, fit = state.refit().with_columns(late(u, 8.0, 1.0)[None])
         for key, gain, lag in (("right", 0.3, 8.0), ("lag", 0.3, 16.0), ("gain", 0.24, 8.0)):
-            found = beside(state, fit, u, u, np.tile(gain * late(u, lag, 1.0), (20, 1)), np.zeros(u.size), 3)
+            found = methods_beside(state, fit, u, u, np.tile(gain * late(u, lag, 1.0), (20, 1)), np.zeros(u.size), 3)
             agrees = sum(all(one.within) for one in found.values())
             agreed[key] += agrees
             assert key == "right" or agrees <= 1

@@ -11,43 +11,43 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from selfcal.adequacy.document import Identified
-from selfcal.adequacy.summary import Number, noisier
-from selfcal.bank.result import Estimate
+from selfcal.adequacy.identify_document import Identified
+from selfcal.adequacy.summary import SheetNumber, noisier
+from selfcal.bank.axis_result import Estimate
 from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis import events, words
-from selfcal.diagnosis.alias import of_readings
+from selfcal.diagnosis.alias import alias_of
 from selfcal.diagnosis.causes import CAUSES
-from selfcal.diagnosis.events import Member, grouped
+from selfcal.diagnosis.channel_looks import FORMS, side_at
+from selfcal.diagnosis.events import EventMember, grouped
 from selfcal.diagnosis.finding import Finding
-from selfcal.diagnosis.forms import FORMS, side_at
-from selfcal.diagnosis.record import Record, of_recording
+from selfcal.diagnosis.record import Record, record_from
 from selfcal.diagnosis.suspicion import suspicions
-from selfcal.likelihood.state import Look, State, interval, log_normal
+from selfcal.likelihood.state import Look, State, log_normal, normal_entry
 from selfcal.logs.recording import load, save
 from selfcal.model.file import Model
 from selfcal.model.forms import formed
 from selfcal.show import identification
-from selfcal.show.findings import show
+from selfcal.show.diagnosis_lines import show
 from selfcal.verbs import identify as identify_verb
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 
 
-def member(axis: str, cause: str, net: float, time_s: float | None = None, **estimate: Any) -> Member:
+def member(axis: str, cause: str, net: float, time_s: float | None = None, **estimate: Any) -> EventMember:
     """A finding that only its look tells apart."""
     when = None if time_s is None else (time_s, time_s)
     look = Look(cause, net, net, estimate, {}, when=when)
     state = cast(State, None)
     entry = {"when": None if when is None else list(when), "estimate": estimate, "gain": None}
-    return Member(axis, Finding(look, 1, state, state), entry, 1.0)
+    return EventMember(axis, Finding(look, 1, state, state), entry, 1.0)
 
 
 def line(hz: float) -> dict[str, Any]:
-    return {"frequency_hz": interval(hz, 1e-4 * hz, "Hz"), "amplitude": interval(1.0, 0.1, "deg/s")}
+    return {"frequency_hz": normal_entry(hz, 1e-4 * hz, "Hz"), "amplitude": normal_entry(1.0, 0.1, "deg/s")}
 
 
-def parts(members: list[Member], quantity: dict[str, Any] | None = None) -> set[tuple[str, ...]]:
+def parts(members: list[EventMember], quantity: dict[str, Any] | None = None) -> set[tuple[str, ...]]:
     """Each event: its cause, then axis and net of every member."""
     return {
         (one.cause, *sorted(f"{each.axis} {each.finding.look.net:g}" for each in one.members))
@@ -129,7 +129,7 @@ def test_a_number_must_move_by_more_than_half_its_interval(
 ) -> None:
     """Stated: 1 with this half of its interval; one that is not identified has an upper limit, here 1 + half."""
     estimate = Estimate(1.0, 1.0, half / 1.6449, 1.0 - half, 1.0 + half, identified)
-    known = cast(Identified, SimpleNamespace(summary={"rrw": Number(estimate)}, group_unit="deg/s", unit="deg/s"))
+    known = cast(Identified, SimpleNamespace(summary={"rrw": SheetNumber(estimate)}, group_unit="deg/s", unit="deg/s"))
     assert (events._times("K", factor, moved, known) is not None) == matters
 
 
@@ -138,12 +138,12 @@ def test_numbers_in_words_have_two_digits_and_no_lists() -> None:
     assert "N 23 % too large" in told and "K not identified" in told and "B 300 times too large" in told
     assert "K hidden" in words.inflation_sentence({"K": 0.0})  # without the cause there is no walk at all
     estimate = {
-        "coefficient": interval(0.031100000000000003, 0.0, "deg/s/degC"),
+        "coefficient": normal_entry(0.031100000000000003, 0.0, "deg/s/degC"),
         "intervals": [[1199.5, 1200.8], [1300.0, 1302.25]],
         "form_also_possible": ["rate", "square"],
         "statistic": "jumps_of_the_bias",
-        "duration_s": interval(3.25, 0.0, "s"),
-        "angle_y_deg": interval(0.4, 0.0, "deg"),
+        "duration_s": normal_entry(3.25, 0.0, "s"),
+        "angle_y_deg": normal_entry(0.4, 0.0, "deg"),
         "measured": 12.32,
     }
     text = words.sizes(estimate)
@@ -162,7 +162,7 @@ def test_a_finding_reads_as_it_is_said() -> None:
     settling = {"cause": "turn_on", "axes": {"gz": {"estimate": {}}}, "estimate": {}}
     assert words.what(settling) == "turn-on transient on gz"
     assert words.small([settling]).startswith("1 small finding (turn-on transient on gz)")
-    of_time, always = {"time_s": interval(70.0, 1.0, "s")}, {"channel": "temp"}
+    of_time, always = {"time_s": normal_entry(70.0, 1.0, "s")}, {"channel": "temp"}
     once, again = "an event: no other time can confirm it", "not confirmed on held-out time"
     for cause, estimate, told in (
         ("tilt", of_time, once),
@@ -217,7 +217,7 @@ def test_a_row_and_the_table_leave_out_the_same(line: float, jump: float, hz: fl
 @pytest.mark.parametrize(("sd", "applied"), [(0.02, True), (0.06, False)])
 def test_a_coefficient_that_is_known_is_applied(sd: float, applied: bool) -> None:
     """Half of its 90 % interval is 3.3 % of it, or 9.9 %."""
-    axes = {"gx": {"estimate": {"coefficient": interval(-1.0, sd, "deg/s/V")}}}
+    axes = {"gx": {"estimate": {"coefficient": normal_entry(-1.0, sd, "deg/s/V")}}}
     finding = {"cause": "supply", "axes": axes, "estimate": {}, "record_next": "Change the supply."}
     assert words.action(finding).startswith("Apply it") == applied
 
@@ -232,16 +232,16 @@ def test_a_line_in_means_is_looked_up_in_the_readings(hz: float, shown: float, l
     values = random.standard_normal(t.size) + 0.3 * np.sin(2.0 * np.pi * hz * t)
     kept = random.random(t.size) >= lost
     np.savez(tmp_path / "log.npz", allow_pickle=False, **{"t[s]": t[kept], "gx[deg/s]": values[kept]})
-    seen = of_readings(load(tmp_path / "log.npz"), "gx", shown, 5e-4, 1.0)
+    seen = alias_of(load(tmp_path / "log.npz"), "gx", shown, 5e-4, 1.0)
     assert seen is not None
     assert seen[0] == pytest.approx(hz, abs=1.0 / 1800.0) and seen[1] == pytest.approx(0.3, rel=0.1)
-    assert of_readings(load(tmp_path / "log.npz"), "gx", 0.17, 5e-4, 1.0) is None
+    assert alias_of(load(tmp_path / "log.npz"), "gx", 0.17, 5e-4, 1.0) is None
 
 
 def test_what_is_recorded_already_is_not_advised(monkeypatch: pytest.MonkeyPatch) -> None:
     """A line of means whose true frequency the readings show: the list and the axis alike say where to look for it."""
     entry = {"estimate": dict(line(0.29)), "axes": {"gx": {"estimate": {}}}, "cause": "periodic", "record_next": ""}
-    monkeypatch.setattr(events, "of_readings", lambda *_: (3.29, 0.3))
+    monkeypatch.setattr(events, "alias_of", lambda *_: (3.29, 0.3))
     recording = SimpleNamespace(rate_hz=40.0, duration_s=1800.0, columns={"gx": SimpleNamespace(unit="deg/s")})
     found = {"gx": SimpleNamespace(record=SimpleNamespace(rate_hz=1.0))}
     assert events._add_readings(entry, cast(Any, recording), cast(Any, found))
@@ -426,13 +426,13 @@ def test_what_is_left_out_is_suspected_no_more(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_noisy_axis_is_told_beside_its_siblings() -> None:
     """Three times the others' noise, known to 10 %; half as noisy, or with one sibling alone, is nothing."""
-    white = {name: {**interval(1.0, 0.06, "deg/s/sqrt(Hz)")} for name in ("gx", "gy")}
-    white |= {"gz": interval(3.1, 0.2, "deg/s/sqrt(Hz)"), "ax": interval(9.0, 0.1, "g/sqrt(Hz)")}
-    white |= {"ay": interval(1.0, 0.1, "g/sqrt(Hz)")}
+    white = {name: {**normal_entry(1.0, 0.06, "deg/s/sqrt(Hz)")} for name in ("gx", "gy")}
+    white |= {"gz": normal_entry(3.1, 0.2, "deg/s/sqrt(Hz)"), "ax": normal_entry(9.0, 0.1, "g/sqrt(Hz)")}
+    white |= {"ay": normal_entry(1.0, 0.1, "g/sqrt(Hz)")}
     assert noisier(white) == ["gz is 3.1 times as noisy as gx and gy"]
-    assert noisier(white | {"gz": interval(1.9, 0.1, "deg/s/sqrt(Hz)")}) == []
+    assert noisier(white | {"gz": normal_entry(1.9, 0.1, "deg/s/sqrt(Hz)")}) == []
     # Of two siblings whose N a line has spoilt, 1e-4 and 1e-6, none is a measure.
-    spoilt = {name: interval(size, 0.1 * size, "deg/s/sqrt(Hz)") for name, size in (("gx", 1e-4), ("gy", 1e-6))}
+    spoilt = {name: normal_entry(size, 0.1 * size, "deg/s/sqrt(Hz)") for name, size in (("gx", 1e-4), ("gy", 1e-6))}
     assert noisier(white | spoilt) == []
 
 
@@ -445,7 +445,7 @@ def test_a_lag_of_several_axes_is_by_all_of_them() -> None:
     assert both["q95"] / both["median"] == pytest.approx(math.exp(1.645 * 0.5 / math.sqrt(2.0)), rel=1e-3)
     assert events._of_all([one, far]) is one
     assert events._of_all([one, one]) is one
-    assert events._of_all([interval(3.0, 4.0, "s"), one])["median"] == 3.0
+    assert events._of_all([normal_entry(3.0, 4.0, "s"), one])["median"] == 3.0
 
 
 def test_what_has_no_name_is_suspected_last(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -489,13 +489,13 @@ def test_several_forms_of_a_channel_have_one_coefficient(tmp_path: Path) -> None
     late = formed(warm - 25.0, "play", 2.5, 0.0, 1.0)
     values = 0.05 * random.standard_normal(t.size) + 0.03 * (warm - 25.0) + 0.05 * late
     save(tmp_path / "log.npz", {"gx": ("deg/h", 3600.0 * values), "temp": ("degC", warm)}, 1.0)
-    record = of_recording(load(tmp_path / "log.npz"), Model.load(None), 1.0)
+    record = record_from(load(tmp_path / "log.npz"), Model.load(None), 1.0)
     state, members = record.axes["gx"].refit(), []
     for number, theta in enumerate([(FORMS.index("static"), math.nan, 0.0), (FORMS.index("play"), 2.5, 0.0)], 1):
         look = side_at(state, record, "temperature", theta)
         after = state.refit(**look.changes)
         entry = {"estimate": {"coefficient": look.estimate["coefficient"]}}
-        members.append(Member("gx", Finding(look, number, state, after), entry, 3600.0))
+        members.append(EventMember("gx", Finding(look, number, state, after), entry, 3600.0))
         state = after
     sum_of = events._on(events.Event(members), "gx")["estimate"]["coefficient"]
     assert abs(sum_of["median"] - 3600.0 * 0.08) < 4.0 * sum_of["sd"]

@@ -15,7 +15,7 @@ import yaml
 from selfcal.adequacy.overbound import overbound, upper_limit
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
-from selfcal.show.export import FORMS, Kind, text_of
+from selfcal.show.export import FORMS, SensorKind, text_of
 from selfcal.verbs.identify import identify
 
 RATE = 4.0
@@ -87,7 +87,7 @@ def test_its_reader_has_the_densities(form: str, rate_hz: float) -> None:
     Gauss-Markov drift what it does in a step beside a correlation time of 40 s; six digits are written."""
     N, K, alpha = 3.1e-4, 7.7e-6, 0.025
     spread = {"N": N, "K": K, "sigma_m": K / math.sqrt(2.0 * alpha), "alpha": alpha}
-    gyro = Kind(spread, {"N": 2.0 * N, "K": 2.0 * K}, 0.95, False, ())
+    gyro = SensorKind(spread, {"N": 2.0 * N, "K": 2.0 * K}, 0.95, False, ())
     text = text_of(
         form, gyro, replace(gyro, median={**spread, "N": 9.0 * N}), {"path": "a", "rate_hz": rate_hz, "duration_s": 1.0}
     )

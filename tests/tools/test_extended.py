@@ -24,9 +24,9 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import _regressors, extended
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.record import record_from
 from selfcal.likelihood.fit import Fit, run
-from selfcal.likelihood.state import Regressor, State
+from selfcal.likelihood.state import FittedColumn, State
 from selfcal.logs.recording import load, save
 from selfcal.model.file import DEFAULT, Model
 from selfcal.verbs.compare import compare
@@ -84,7 +84,7 @@ def case(cause: str, seed: int, folder: Path) -> Case:
     base = base_model(rate_hz)
     model, log = written(base, folder / "base.yaml"), folder / "log.npz"
     simulate(model, log, seed=seed, effects=[f"{cause}:{text},axis=gx"])
-    record = of_recording(load(log), Model.load(model))
+    record = record_from(load(log), Model.load(model))
     found = diagnose_record(record, ["gx"])
     return Case(log, base, found["gx"], extended(Model.load(model), record, found)[0])
 
@@ -248,7 +248,7 @@ def test_the_noise_level_is_that_of_the_recording(lag1: float, tmp_path: Path) -
 
 def test_a_column_without_an_entry_is_no_regressor() -> None:
     """A cause may have a column that no model file states: the file has its effect alone."""
-    column = Regressor("toy", "ramp", np.arange(8.0), "1", {})
+    column = FittedColumn("toy", "ramp", np.arange(8.0), "1", {})
     found: Any = {"gx": SimpleNamespace(state=SimpleNamespace(regressors=(column,)), findings=[])}
     record: Any = None
     assert _regressors(Model.load(), record, found) == []

@@ -24,12 +24,12 @@ import pytest
 
 from selfcal.base.errors import UserError
 from selfcal.base.units import factor
-from selfcal.batch.batch_summary import document_of, lines_of, summed_up
-from selfcal.batch.files import Source
+from selfcal.batch.batch_files import BatchSource
+from selfcal.batch.batch_summary import batch_keys, lines_of, summed_up
 from selfcal.batch.fleet import document_with, judged_units
-from selfcal.batch.fleet_page import page
+from selfcal.batch.fleet_page import fleet_html
 from selfcal.batch.spread import DEATHS, Row, spread
-from selfcal.batch.unit_table import COLUMNS, Unit
+from selfcal.batch.unit_table import COLUMNS, BatchUnit
 from selfcal.batch.verdicts import Limits
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
@@ -402,12 +402,12 @@ def test_a_scheduler_that_is_killed_loses_nothing(tmp_path: Path) -> None:
     assert (tmp_path / "t.csv").read_bytes() == (tmp_path / "here.csv").read_bytes()
 
 
-def synthetic(units: int, seed: int = 1) -> list[Unit]:
+def synthetic(units: int, seed: int = 1) -> list[BatchUnit]:
     """Recordings of three axes as `fleet` keeps them, of four stations, 50 a day; one in 100 odd, one in 200 broken."""
     random = np.random.default_rng(seed)
     found = []
     for k in range(units):
-        source = Source(
+        source = BatchSource(
             f"logs/u{k:05}.npz",
             device=f"d{k:05}",
             station=f"s{k % 4}",
@@ -437,7 +437,7 @@ def synthetic(units: int, seed: int = 1) -> list[Unit]:
                 "marks": ["saturation"] if k % 300 == 5 else [],
             }
         record = {"error": "broken <b>"} if k % 200 == 3 else {"recording": {"duration_s": 3600.0}, "axes": axes}
-        found.append(Unit(source, record))
+        found.append(BatchUnit(source, record))
     return found
 
 
@@ -449,7 +449,7 @@ def test_an_axis_of_another_kind_is_left_out_with_a_line() -> None:
     summary = summed_up(batch, Model.load())
     (line,) = [line for line in lines_of(summary) if line.startswith("left out")]
     assert line == "left out of the population: gy of d00008: reads in m/s^2, the model in deg/s"
-    units = {name: one["units"] for name, one in document_of(summary)["population"].items()}
+    units = {name: one["units"] for name, one in batch_keys(summary)["population"].items()}
     assert units["gx.N"] - units["gy.N"] == 1 == units["gx.bias"] - units["gy.bias"]
 
 
@@ -469,7 +469,7 @@ def test_n_of_a_unit_without_numbers_of_the_batchs_law_is_compared() -> None:
     summary = summed_up(batch, Model.load())
     words = summary.unlike["d00009"]
     assert len(words) == 1 and words[0].startswith("gx.N ")
-    population = document_of(summary)["population"]
+    population = batch_keys(summary)["population"]
     assert population["gx.N"]["left_out"] == ["d00009"] and population["gx.bias"]["left_out"] == []
     assert population["gx.K"]["units"] == population["gx.N"]["units"] - 1
 
@@ -498,11 +498,11 @@ def test_a_quantity_that_few_units_identify_is_a_line() -> None:
             estimates = one.record["axes"]["gz"]["parameters"]["random_walk"]
             estimates["N"] = {**estimates["N"], "identified": False}
     summary = summed_up(batch, Model.load())
-    document = document_of(summary)
+    document = batch_keys(summary)
     assert document["unidentified"] == {"gz.N": {"identified": 3, "units": 9}}
     assert "gz.N" not in document["population"] and "gz.K" in document["population"]
     (line,) = [line for line in lines_of(summary) if line.startswith("no population of gz.N: 3 of 9 units identify it")]
-    assert line in page({**document_with(batch, None, []), **document}, summary, {})
+    assert line in fleet_html({**document_with(batch, None, []), **document}, summary, {})
 
 
 def test_the_page_stays_small(tmp_path: Path) -> None:
@@ -512,8 +512,8 @@ def test_the_page_stays_small(tmp_path: Path) -> None:
     limits.write_text("gyro.N: {max: 0.021 deg/s/sqrt(Hz)}\n")
     judged = judged_units(batch, Limits.load(limits, Model.load()))
     summary = summed_up(batch, Model.load())
-    document = {**document_with(batch, None, judged), **document_of(summary)}
-    text = page(document, summary, {})
+    document = {**document_with(batch, None, judged), **batch_keys(summary)}
+    text = fleet_html(document, summary, {})
     assert len(text.encode()) < 1_000_000
     assert "<script" not in text and "http://" not in text and "https://" not in text
     assert "broken &lt;b&gt;" in text and "<b>d00107</b>: gx.K " in text

@@ -19,7 +19,7 @@ from rich.console import Console
 from scipy.signal import lfilter
 
 from selfcal.diagnosis import hidden, module
-from selfcal.likelihood.joint import bins_of, course, fitted, last
+from selfcal.likelihood.joint import bins_of, course, fit_joint, last
 from selfcal.likelihood.state import NET_LEAST
 from selfcal.logs.recording import load, save
 from selfcal.model.file import DEFAULT, Model
@@ -137,8 +137,8 @@ def test_axes_of_their_own_share_nothing() -> None:
         if seed % 2:  # white noise may go together all the same
             y[1] = 0.6 * y[0] + 0.8 * y[1]
         bins = bins_of(y - y.mean(axis=1)[:, None])
-        null = fitted(bins, 1.0, False)
-        worth = fitted(bins, 1.0, True, null).value - null.value
+        null = fit_joint(bins, 1.0, False)
+        worth = fit_joint(bins, 1.0, True, null).value - null.value
         assert hidden.net(worth, len(y) + 1, hidden.LN_EITHER) < NET_LEAST or seed % 2, seed
 
 
@@ -160,7 +160,7 @@ def test_the_filter_is_the_dense_likelihood() -> None:
     levels is the same in both, so it cancels but for 1e-6."""
     random = np.random.default_rng(11)
     y = drawn(random, 3, 60) + np.outer([0.5, 0.7, -0.6], markov(random, 60, 10.0))
-    model = fitted(bins_of(drawn(random, 3, 600)), 1.0, True)
+    model = fit_joint(bins_of(drawn(random, 3, 600)), 1.0, True)
     other = replace(model, loading=np.zeros_like(model.loading))
     got = course(model, y).ln_likelihood - course(other, y).ln_likelihood
 
@@ -187,7 +187,7 @@ def test_the_last_bias_is_the_dense_one() -> None:
     n, m = 50, 3
     y = drawn(random, m, n) + np.outer([0.5, 0.7, -0.6], markov(random, n, 10.0))
     y[1, 20:24] = np.nan
-    model = replace(fitted(bins_of(drawn(random, m, 600)), 1.0, True), loading=np.array([0.5, 0.7, -0.6]), rate=0.1)
+    model = replace(fit_joint(bins_of(drawn(random, m, 600)), 1.0, True), loading=np.array([0.5, 0.7, -0.6]), rate=0.1)
     t = np.arange(n + 1)
     S = np.kron(np.outer(model.loading, model.loading), np.exp(-model.rate * np.abs(t[:, None] - t)))
     for k, (ln_n, ln_rho, ln_m, ln_a) in enumerate(model.own):

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
 from selfcal.bank import reference
-from selfcal.bank.blocks import block_means, kept_out
+from selfcal.bank.blocks import blocks_of, kept_out
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
@@ -45,11 +45,11 @@ def test_report_against_the_continuous_reference(law: str, n: int) -> None:
     """The float library's interpolated report against the textbook bank, refined until it settles."""
     worst = np.zeros(4)
     for index in range(4):
-        truth = draw(GROUP, law, np.random.default_rng([n, index, 7]))
+        truth = draw_parameters(GROUP, law, np.random.default_rng([n, index, 7]))
         y = simulate_bank_samples(law, truth, 1.0, n, seed=100 + index)[0].astype(np.float32)
         bank = Bank(make_tables(MODEL, 1.0, ("gx",)))
         bank.push(y[:, None])
-        dense = reference.identify_axis(y.astype(np.float64), 1.0, GROUP, MODEL.hypotheses)
+        dense = reference.reference_axis(y.astype(np.float64), 1.0, GROUP, MODEL.hypotheses)
         worst = np.maximum(worst, worst_difference(bank.report(0), dense))
     print(
         f"\n{law} n={n}: d ln evidence {worst[0]:.3f}, dP {worst[1]:.4f}, "
@@ -146,7 +146,7 @@ def test_block_means_follow_the_library() -> None:
     missing[[50, 500, 4000]] = 3, 777, 12
     bank = Bank(make_tables(MODEL, 10.0, ("gx",)))
     bank.push(samples[:, None], missing)
-    blocks = block_means(samples.astype(np.float64), missing, 10, GROUP)
+    blocks = blocks_of(samples.astype(np.float64), missing, 10, GROUP)
     present = np.isfinite(blocks.mean)
     assert bank.raw.count == present.sum()
     node = bank.raw.node(0, 0)
@@ -380,7 +380,7 @@ def test_a_ramp_is_no_adequate_random_walk(tmp_path: Path) -> None:
     means = []
     for seed in range(12):
         law = PLAIN[seed % 3]
-        y, _ = simulate_bank_samples(law, draw(GROUP, law, np.random.default_rng(seed)), 1.0, 2000, seed)
+        y, _ = simulate_bank_samples(law, draw_parameters(GROUP, law, np.random.default_rng(seed)), 1.0, 2000, seed)
         save(log, {"gx": ("deg/s", y)}, 1.0, {})
         check = identify(log)["axes"]["gx"]["checks"]["innovation_mean"]
         assert check["passed"]

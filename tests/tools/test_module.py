@@ -19,12 +19,12 @@ from scipy.stats import binom
 
 from selfcal.diagnosis import module
 from selfcal.diagnosis.causes import tilt
-from selfcal.diagnosis.document import to_document
+from selfcal.diagnosis.diagnose_document import diagnose_document
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.loop import _give, diagnose_record
-from selfcal.diagnosis.record import Record, of_recording
+from selfcal.diagnosis.record import Record, record_from
 from selfcal.likelihood.joint import Joint, act, course, information
-from selfcal.likelihood.state import Look, State, interval
+from selfcal.likelihood.state import Look, State, normal_entry
 from selfcal.logs.recording import Column, Recording, load, save
 from selfcal.model.file import Model
 from selfcal.readings.budget import OF_MODULES
@@ -44,7 +44,7 @@ def drawn(seed: int, n: int, m: int = 6) -> Array:
     return found
 
 
-def seen(y: Array, **channels: Array) -> module.Module:
+def seen(y: Array, **channels: Array) -> module.JointModule:
     """The records looked at together."""
     states: dict[str, Any] = {
         name: SimpleNamespace(
@@ -311,7 +311,14 @@ def test_a_column_that_an_axis_has_is_no_event_again() -> None:
     found = {"gx": Diagnosed(state, state, record)}
     states = {"gx": state}
     for number, width_s in enumerate((1.0, 30.0), 1):
-        _give(record, found, states, module.Event(("gx",), "temperature", (0.0, math.nan, width_s), 20.0), number, 1.0)
+        _give(
+            record,
+            found,
+            states,
+            module.JointEvent(("gx",), "temperature", (0.0, math.nan, width_s), 20.0),
+            number,
+            1.0,
+        )
     (finding,) = found["gx"].findings
     assert [column.name for column in finding.columns] == ["temperature"]
 
@@ -398,7 +405,7 @@ def _looks(sizes: dict[str, float], turned: float) -> dict[str, Look]:
             "step",
             50.0,
             40.0,
-            {"time_s": interval(499.5, 0.3, "s"), "amplitude": interval(size, 0.003, "m/s^2")},
+            {"time_s": normal_entry(499.5, 0.3, "s"), "amplitude": normal_entry(size, 0.003, "m/s^2")},
             {},
             when=(499.5, 499.5),
         )
@@ -433,7 +440,7 @@ def test_a_turn_has_the_angles_of_its_final_sizes(tmp_path: Path) -> None:
         drawn[name] = drawn[name] + 0.006 * random.standard_normal(n) + line * np.sin(0.93 * t + phase)
     save(tmp_path / "log.npz", {name: ("m/s^2", y) for name, y in drawn.items()}, 1.0)
     recording = load(tmp_path / "log.npz")
-    found = diagnose_record(of_recording(recording, Model.load(None)), list(drawn))
+    found = diagnose_record(record_from(recording, Model.load(None)), list(drawn))
     looks = {name: [each.look for each in found[name].findings if each.look.cause == "tilt"] for name in ("ax", "ay")}
     for name, other, sign, truth in (("ax", "y", 1.0, 0.3), ("ay", "x", -1.0, -0.5)):
         (look,) = looks[name]
@@ -459,7 +466,9 @@ def _of_one_axis(sizes: dict[str, float], gravity: str = "az") -> set[str]:
     recording = Recording(
         Path("a"), 1.0, {k: Column(k, "m/s^2", v) for k, v in columns.items()}, np.zeros(n, np.int64), {}
     )
-    document = to_document(recording, diagnose_record(of_recording(recording, Model.load(None)), list(sizes)), {}, {})
+    document = diagnose_document(
+        recording, diagnose_record(record_from(recording, Model.load(None)), list(sizes)), {}, {}
+    )
     (finding,) = document["axes"][next(iter(sizes))]["findings"]
     assert finding["cause"] == "step"
     return set(finding["also_possible"])

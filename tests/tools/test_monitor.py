@@ -23,7 +23,7 @@ from selfcal.model.file import Model
 from selfcal.verbs.identify import identify
 from selfcal.verbs.monitor import monitor
 from selfcal.wire.dbc_file import PLACE_NAMES
-from selfcal.wire.frames import REASONS, AxisReport, Decoder, Link, names_of, open_bus
+from selfcal.wire.frames import REASONS, AxisReport, Decoder, Link, open_bus, wire_names
 from selfcal.wire.live import View
 
 from conftest import run
@@ -32,7 +32,7 @@ from wire_stream import lines, message, serial_line, stream
 #: What an axis's report has no number for where the record lies outside the priors.
 NO_NUMBER = ("bias_mean", "bias_sd", "h0_probability", "h1_probability", "h2_probability")
 #: The names of the default model.
-NAMES = names_of(Model.load())
+NAMES = wire_names(Model.load())
 
 
 def text_of(sent_lines: list[str]) -> bytes:
@@ -238,7 +238,7 @@ def test_user_errors_are_one_line(
     options: list[str], complaint: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["selfcal", "monitor", *options])
-    monkeypatch.setattr(cli, "install", lambda: None)  # pytest keeps its signals
+    monkeypatch.setattr(cli, "install_signals", lambda: None)  # pytest keeps its signals
     with pytest.raises(SystemExit) as end:
         cli.main()
     said = capsys.readouterr().err

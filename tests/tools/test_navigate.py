@@ -15,9 +15,10 @@ import pytest
 from scipy import stats
 
 from selfcal.bank.library import Bank
+from selfcal.base.grid import Array
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.model.file import Model
-from selfcal.model.simulated_parts import AXES, LAWS, Floats
+from selfcal.model.simulated_parts import AXES, LAWS
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigate import FIGURES, HORIZONS_S, TIMES, TITLES, identified_noise, matched, sheet_noise, show
 from selfcal.studies.navigation import (
@@ -27,8 +28,8 @@ from selfcal.studies.navigation import (
     RATE_HZ,
     SCALE,
     TAKE_OFF_S,
+    FilterNoise,
     Filters,
-    Noise,
     Part,
     flight,
     nees,
@@ -38,10 +39,10 @@ from selfcal.verbs.navigate import navigate
 
 from conftest import run
 
-Judged = list[tuple[Floats, Floats]]
+Judged = list[tuple[Array, Array]]
 
 
-def flown(part: Part, noise: Noise) -> Judged:
+def flown(part: Part, noise: FilterNoise) -> Judged:
     filters = Filters(noise, part)
     filters.rest()
     return filters.fly()
@@ -65,7 +66,7 @@ def test_the_flight_is_in_coordinated_turns() -> None:
 @pytest.mark.parametrize("law", LAWS)
 def test_without_errors_there_are_none(law: str) -> None:
     """Every reading is the truth. What is left is the rounding of 3600 steps over kilometres: 1e-16 of each."""
-    for errors, _ in flown(Part.of(law, [1], noise=0.0), Noise.of([true_noise(law)])):
+    for errors, _ in flown(Part.of(law, [1], noise=0.0), FilterNoise.of([true_noise(law)])):
         assert np.abs(errors).max() < 1e-8
 
 
@@ -77,7 +78,7 @@ def test_the_latency_is_found() -> None:
     t = np.arange(len(flight().position)) / RATE_HZ
     heard = np.stack([np.interp(np.arange(GPS_S) - 0.15, t, axis) for axis in flight().position.T], axis=1)
     late = replace(part, gps=heard[None], latency=np.array([[0.15]]))
-    errors, covariance = flown(late, Noise.of([true_noise("constant")]))[0]
+    errors, covariance = flown(late, FilterNoise.of([true_noise("constant")]))[0]
     assert errors[0, -1] == pytest.approx(0.15 * covariance[0, -1, -1] / LATENCY_SD_S**2, abs=0.002)
     assert covariance[0, -1, -1] < (0.3 * LATENCY_SD_S) ** 2
 
@@ -87,10 +88,10 @@ def test_consistent_with_the_true_noise_alone() -> None:
     chi-squared. The parts' drifts are larger than the data sheet's, ten times its noise is larger than theirs."""
     seeds, mean = range(1, 51), {}
     for name in ("true", "sheet", "inflated"):
-        found: list[list[Floats]] = []
+        found: list[list[Array]] = []
         for law in LAWS if name == "true" else ("random_walk",):
             noise = {"true": true_noise(law), "sheet": sheet_noise(), "inflated": sheet_noise(10.0)}[name]
-            judged = flown(Part.of(law, seeds), Noise.of([noise] * len(seeds)))
+            judged = flown(Part.of(law, seeds), FilterNoise.of([noise] * len(seeds)))
             found.append([nees(*one) for one in judged])
         mean[name] = np.concatenate(found, axis=1).mean(axis=1)
     count = len(LAWS) * len(seeds)
@@ -126,7 +127,7 @@ def test_the_identified_drift_is_as_uncertain_as_the_bank_states() -> None:
         now, *later = (bank.report(k, ahead_s=ahead).bias_sd ** 2 for ahead in (0.0, *HORIZONS_S))
         assert now > 0.0
         for ahead, variance, tolerance in zip(HORIZONS_S, later, (0.02, 1e-3), strict=True):
-            kept, grown = Noise.of([[found] * len(AXES)]).step(ahead)
+            kept, grown = FilterNoise.of([[found] * len(AXES)]).step(ahead)
             assert kept[0, k] ** 2 * now + grown[0, k] / SCALE[k] ** 2 == pytest.approx(variance, rel=tolerance)
 
 

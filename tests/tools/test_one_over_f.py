@@ -11,7 +11,7 @@ import yaml
 from drifts import assert_held, noise
 from noise_coverage import FLICKER_HZ, numbers_of, one_over_f, with_one_over_f
 
-from selfcal.adequacy.one_over_f import beside_its_law, density_above, white_of
+from selfcal.adequacy.one_over_f import beside_its_law, density_above, white_beside
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import make_tables
 from selfcal.show import identification
@@ -46,7 +46,7 @@ def test_white_noise_beside_1_over_f_and_back() -> None:
         draws = {name: np.array([value]) for name, value in truth.items()}
         draws["N"][0] = beside_its_law(truth, 1.0, 10)
         assert draws["N"][0] > 0.02
-        assert white_of(draws, 1.0, 10)[0] == pytest.approx(0.02, rel=1e-9)
+        assert white_beside(draws, 1.0, 10)[0] == pytest.approx(0.02, rel=1e-9)
 
 
 @pytest.mark.parametrize("minutes", [20, 50])

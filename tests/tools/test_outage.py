@@ -19,37 +19,38 @@ from outage_truth import COEFFICIENT, N, part, stated
 
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.diagnosis import words
-from selfcal.diagnosis.carried import Term, with_terms
+from selfcal.diagnosis.carried import BankTerm, with_terms
 from selfcal.diagnosis.finding import Finding
 from selfcal.likelihood.state import Look
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.regressors import offered
-from selfcal.model.simulated_parts import AXES, SHEET_N, Floats
+from selfcal.model.simulated_parts import AXES, SHEET_N
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import (
     GPS_S,
-    LONGEST_S,
+    LONGEST_OUTAGE_S,
     RATE_HZ,
+    FilterNoise,
     Filters,
-    Noise,
     Part,
     flight,
 )
-from selfcal.studies.outage import COORDINATES, OUTAGES_S, Known, flights, words_of
+from selfcal.studies.outage import COORDINATES, OUTAGES_S, KnownAxis, flights, words_of
 from selfcal.verbs.diagnose import diagnose, show
 from selfcal.verbs.simulate import simulate
 
-STEPS = (GPS_S + LONGEST_S) * RATE_HZ
+STEPS = (GPS_S + LONGEST_OUTAGE_S) * RATE_HZ
 SHEET = [{"N": SHEET_N[unit]} for unit in AXES.values()]
 
 
-def off(rest: Floats, errors: Floats, tilt: float = 0.0) -> list[Floats]:
+def off(rest: Array, errors: Array, tilt: float = 0.0) -> list[Array]:
     """Errors of the position [3] after each outage, of a flight with these errors of the readings and another tilt."""
     own = Part.of_errors(rest[None], errors[None])
     own = replace(own, start_attitude=own.start_attitude + np.array([tilt, 0.0, 0.0]))
-    filters = Filters(Noise.of([SHEET]), own)
+    filters = Filters(FilterNoise.of([SHEET]), own)
     filters.rest()
     return [judged[0][0, :3] for judged in filters.fly(OUTAGES_S)]
 
@@ -94,7 +95,7 @@ def test_how_sure_the_filter_is(share: float) -> None:
     chi-squared of 3 has an sd of 20 %, a ratio of sd half of it."""
     random = np.random.default_rng(5)
     told = {
-        name: Known({"N": share * SHEET_N[unit]}, SHEET_N[unit] * random.standard_normal(12000))
+        name: KnownAxis({"N": share * SHEET_N[unit]}, SHEET_N[unit] * random.standard_normal(12000))
         for name, unit in AXES.items()
     }
     side = flights(told)[f"{OUTAGES_S[-1]}"]
@@ -123,7 +124,7 @@ def test_a_change_of_the_noise_beside_a_column() -> None:
     tree = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
     tree["regressors"] = [{"name": "warm", "kind": "turn_on", "tau_s": 50.0, "sd": {"gyro": 1.0}, "probability": 0.5}]
     look, none = Look("variance_change", 20.0, 15.0, {}, {}, when=(500.0, 500.0)), cast(Any, None)
-    term = Term(Finding(look, 1, none, none), (), (), False)
+    term = BankTerm(Finding(look, 1, none, none), (), (), False)
     assert with_terms(Model.load(), none, {}, "gx", [term], []).handling.variance_changes
     own = with_terms(Model.load(), none, {}, "gx", [term], Model.of_tree(tree, DEFAULT).regressors)
     Bank(make_tables(replace(own, regressors=offered(own, "gx")), 1.0, ("gx",)))
@@ -131,7 +132,7 @@ def test_a_change_of_the_noise_beside_a_column() -> None:
 
 def test_errors_that_are_too_short() -> None:
     with pytest.raises(UserError, match="flights need a recording of 1200 s or more"):
-        flights({"gx": Known({"N": N}, np.zeros(1190))})
+        flights({"gx": KnownAxis({"N": N}, np.zeros(1190))})
 
 
 def test_the_sentence_comes_true(tmp_path: Path) -> None:

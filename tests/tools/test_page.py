@@ -22,24 +22,24 @@ import numpy as np
 import pytest
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.base.output import write_text
 from selfcal.diagnosis import integrity
 from selfcal.diagnosis.causes import colored_noise, periodic, ramp, step, variance_change
 from selfcal.diagnosis.causes import outliers as outliers_cause
-from selfcal.diagnosis.document import to_document
+from selfcal.diagnosis.channel_looks import side_looks
+from selfcal.diagnosis.diagnose_document import diagnose_document
 from selfcal.diagnosis.events import add_findings
 from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.record import Missing, Record, of_recording
+from selfcal.diagnosis.record import Missing, Record, record_from
 from selfcal.diagnosis.words import named
 from selfcal.likelihood.state import Look, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
 from selfcal.show import chart, pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, outside_of
-from selfcal.show.diagnosis_page import page
+from selfcal.show.diagnosis_page import diagnosis_html
 
 from conftest import run
 
@@ -265,11 +265,11 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     rows = np.column_stack([np.arange(n) / rate, gx, gy, temperature])
     np.savetxt(path, rows, delimiter=",", fmt="%.9g", header="t[s],gx[deg/s],gy[deg/s],temp[degC]", comments="")
     recording = load(path)
-    record = of_recording(recording, Model.load(None))
+    record = record_from(recording, Model.load(None))
     found = diagnose_record(record, ("gx", "gy"))
-    document = to_document(recording, found, {}, {"name": "extended"})
+    document = diagnose_document(recording, found, {}, {"name": "extended"})
     add_findings(document, recording, found, {}, None)
-    return Case(document, record, found, page(document, record, found))
+    return Case(document, record, found, diagnosis_html(document, record, found))
 
 
 def test_the_findings_stand_at_the_top(case: Case) -> None:
@@ -317,7 +317,9 @@ def test_causes_by_axis_and_the_noise_stand_at_the_top(case: Case) -> None:
         },
     }
     axes = case.document["axes"]
-    text = page({**case.document, "axes": {**axes, "gx": {**axes["gx"], "posterior": known}}}, case.record, case.found)
+    text = diagnosis_html(
+        {**case.document, "axes": {**axes, "gx": {**axes["gx"], "posterior": known}}}, case.record, case.found
+    )
     heads, *rows = cells_of(text, "Causes by axis")
     assert heads == ["cause", "gx", "gy"]
     shown = {row[0].replace(" ", "_"): row[1:] for row in rows}
@@ -345,7 +347,7 @@ def test_small_findings_are_folded_whatever_their_evidence(case: Case) -> None:
         box = {"of": name, "words": f"A {name} one.", "evidence_gain_nats": gain, "net_nats": gain}
         findings.append({**entry["findings"][0], **own, **box})
     axis = {**entry, "findings": findings, "material": ["near", "weak"]}
-    text = page({**case.document, "findings": events, "axes": {"gx": axis}}, case.record, case.found)
+    text = diagnosis_html({**case.document, "findings": events, "axes": {"gx": axis}}, case.record, case.found)
     folded = "".join(re.findall(r"<details.*?</details>", text[: text.index("Whole record")], re.DOTALL))
     for name in nats:
         assert (f"A {name} one." in folded) == (f"Mend the {name} one.</td>" in folded) == (name == "strong")
@@ -369,7 +371,7 @@ def test_an_allan_curve_that_still_leaves_its_band_is_told(case: Case, monkeypat
         return shifted, own
 
     monkeypatch.setattr(pictures, "figures", lifted)
-    text = page(case.document, case.record, case.found)
+    text = diagnosis_html(case.document, case.record, case.found)
     assert text.count("The Allan curve still leaves its band") == 2
     assert [row[6].startswith("✗ leaves its band: ") for row in cells_of(text, "Noise of each axis")[1:]] == [True] * 2
 
@@ -413,7 +415,7 @@ def test_the_commands_on_the_page_reproduce_it(tmp_path: Path) -> None:
 
 
 def test_the_same_diagnosis_makes_the_same_page(case: Case) -> None:
-    assert page(case.document, case.record, case.found) == case.text
+    assert diagnosis_html(case.document, case.record, case.found) == case.text
 
 
 def test_the_page_is_well_built(case: Case) -> None:
@@ -451,7 +453,7 @@ def test_text_from_files_runs_nothing(case: Case) -> None:
     entry["findings"] = [first, *entry["findings"][1:]]
     entry["not_found"] = [{"cause": HOSTILE, "would_have_been_found": {HOSTILE: {"value": 1.0, "unit": HOSTILE}}}]
     document |= {"axes": {HOSTILE: entry}, "model": {HOSTILE: HOSTILE}}
-    parsed = Page(page(document, case.record, {HOSTILE: case.found["gx"]}))
+    parsed = Page(diagnosis_html(document, case.record, {HOSTILE: case.found["gx"]}))
     assert not parsed.named("script") and not parsed.named("img")
     assert not any(name.startswith("on") for _, attributes in parsed.tags for name in attributes)
     assert parsed.text.count(HOSTILE) > 8
@@ -465,13 +467,13 @@ def test_keys_that_the_document_lacks_are_left_out(case: Case) -> None:
     lean = {"unit": entry["unit"], "verdict": entry["verdict"], "discrepancies": []}
     lean["findings"] = [{key: one[key] for key in few} for one in entry["findings"]]
     document = {key: value for key, value in case.document.items() if key != "model"} | {"axes": {"gx": lean}}
-    text = Page(page(document, case.record, case.found)).text
+    text = Page(diagnosis_html(document, case.record, case.found)).text
     assert "temperature" in text and "None" not in text and "nan" not in text.lower().split()
 
 
 def test_an_axis_without_a_result_is_told(case: Case) -> None:
     document = {**case.document, "axes": {**case.document["axes"], "gz": {"error": "every reading is the same"}}}
-    text = Page(page(document, case.record, case.found)).text
+    text = Page(diagnosis_html(document, case.record, case.found)).text
     assert "Not diagnosed: gz. every reading is the same" in text and "Not adequate: gx." in text
 
 
@@ -485,7 +487,7 @@ def test_a_page_with_many_findings_stays_small(case: Case) -> None:
     findings = [{**step_told, "shared_with": [], "words": f"Finding {k}."} for k in range(10)]
     names = ("gx", "gy", "gz", "ax", "ay", "az")
     document = {**case.document, "axes": {name: {**entry, "findings": findings} for name in names}}
-    text = page(document, case.record, dict.fromkeys(names, many))
+    text = diagnosis_html(document, case.record, dict.fromkeys(names, many))
     assert 900_000 < len(text.encode()) <= 1_000_000
     assert "left out to keep the page small" in text
     assert all(text.count(f"<p>Finding {k}.</p>") == 6 for k in range(10))
@@ -493,17 +495,17 @@ def test_a_page_with_many_findings_stays_small(case: Case) -> None:
 
 def test_the_page_is_written_whole_or_not_at_all(case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "report.html"
-    write_text(path, page(case.document, case.record, case.found))
+    write_text(path, diagnosis_html(case.document, case.record, case.found))
     assert path.read_text(encoding="utf-8") == case.text
     with pytest.raises(UserError, match="cannot be written"):
-        write_text(tmp_path / "none" / "report.html", page(case.document, case.record, case.found))
+        write_text(tmp_path / "none" / "report.html", diagnosis_html(case.document, case.record, case.found))
 
     def full(self: Path, target: Path) -> Path:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(UserError, match="No space left"):
-        write_text(path, page(case.document, case.record, case.found))
+        write_text(path, diagnosis_html(case.document, case.record, case.found))
     assert [one.name for one in tmp_path.iterdir()] == ["report.html"]
     assert path.read_text(encoding="utf-8") == case.text
 
@@ -554,7 +556,7 @@ def test_the_answer_is_on_the_first_screen(browser: Any, case: Case, tmp_path: P
     event = case.document["findings"][0]
     events = [{**event, "id": kind, "axes": dict.fromkeys(names, event["axes"]["gx"])} for kind in ("a", "b", "c")]
     document = {**case.document, "findings": events, "axes": dict.fromkeys(names, case.document["axes"]["gx"])}
-    text = page(document, case.record, dict.fromkeys(names, case.found["gx"]))
+    text = diagnosis_html(document, case.record, dict.fromkeys(names, case.found["gx"]))
     (tmp_path / "report.html").write_text(text, encoding="utf-8")
     view = browser.new_page(viewport={"width": width, "height": height})
     view.goto((tmp_path / "report.html").as_uri())

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from selfcal.adequacy.allan import overlapping
+from selfcal.adequacy.allan import overlapping_variance
 from selfcal.adequacy.drawn import simulate_bank_samples
-from selfcal.bank.result import Estimate
+from selfcal.bank.axis_result import Estimate
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
@@ -107,7 +107,7 @@ def test_the_true_curves(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
     ]
     power = np.array([signal.welch(y, nperseg=section3.PIECE, detrend="constant")[1][5:-1] for y in records])
     m = told["Fig. 4"][place].curves[1].x
-    variance = np.array([[overlapping(y, int(one))[0] for one in m] for y in records])
+    variance = np.array([[overlapping_variance(y, int(one))[0] for one in m] for y in records])
     for found, true in (
         (power, told["Fig. 3"][place].curves[1].y[4:]),
         (variance, told["Fig. 4"][place].curves[1].y ** 2),

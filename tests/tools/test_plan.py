@@ -19,7 +19,7 @@ from test_cases_priors import at_rest, write
 
 from selfcal.base.errors import UserError
 from selfcal.batch.design import Experiment, drawn_rows
-from selfcal.batch.plan import LEAST, Wish, _half_interval, coefficient_rows, rows_of, steady
+from selfcal.batch.plan import LENGTH_LEAST, Wish, _half_interval, coefficient_rows, rows_of, steady_level
 from selfcal.model.file import DEFAULT, Model
 from selfcal.verbs.part import part as part_of_log
 from selfcal.verbs.plan import plan
@@ -86,7 +86,7 @@ def test_the_planned_length_suffices(tmp_path: Path, name: str) -> None:
         reached = share(wish, samples)
         print(f"{name}, {text}: {entry['duration_s']:.0f} s, reached by {reached:.3f}")
         assert reached >= 0.9 - off[0], (text, reached)
-        if reached > 0.9 + off[1] and samples > LEAST:
+        if reached > 0.9 + off[1] and samples > LENGTH_LEAST:
             assert share(wish, math.floor(0.97 * samples)) <= 0.9 + off[1], (text, reached)
     assert document["duration_s"] == max(one["duration_s"] for one in document["wishes"])
 
@@ -294,8 +294,8 @@ def test_a_bias_in_its_steady_state_has_a_line() -> None:
     lengths = (100.0, 200.0, 400.0)
     walk = [{"duration_s": one, "q10": 0.01, "q50": 0.02, "q90": 0.03 + 1.0 / one**2} for one in lengths]
     white = [{"duration_s": one, "q10": 0.1, "q50": 0.2, "q90": one**-0.5} for one in lengths]
-    assert steady(walk) == walk[-1]["q90"]
-    assert steady(white) is None and steady(walk[:1]) is None
+    assert steady_level(walk) == walk[-1]["q90"]
+    assert steady_level(white) is None and steady_level(walk[:1]) is None
 
 
 def test_a_plan_of_an_input_names_what_is_missing(tmp_path: Path) -> None:

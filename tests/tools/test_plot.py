@@ -9,14 +9,14 @@ import pytest
 from matplotlib import pyplot
 
 from selfcal.model.file import Model
-from selfcal.show.plot import plot_run
+from selfcal.show.run_plot import plot_run
 from selfcal.wire.dbc_file import BY_PLACE, Names
-from selfcal.wire.frames import AxisReport, names_of
+from selfcal.wire.frames import AxisReport, wire_names
 
 G = 9.80665  # m/s^2
 
 
-NAMES = names_of(Model.load())
+NAMES = wire_names(Model.load())
 
 
 def report(axis: str, time_s: float, probability: tuple[float, float, float], scale: float = 1.0) -> AxisReport:

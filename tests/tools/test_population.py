@@ -20,11 +20,11 @@ from fleet_power import model_of, study
 from numpy.typing import NDArray
 
 from selfcal.adequacy.drawn import simulate_bank_samples
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
-from selfcal.bank.result import HALF_90
 from selfcal.base.units import factor
 from selfcal.batch.batch_summary import apart_words, seen_from_words
-from selfcal.batch.drift import Series, drifts_of
+from selfcal.batch.drift import DriftSeries, drifts_of
 from selfcal.batch.population import FALSE_NAME, TWO_GROUPS, Measured, Population, populations
 from selfcal.logs.recording import save
 from selfcal.model.file import DEFAULT, Model, read_yaml
@@ -311,14 +311,16 @@ def test_the_study_of_odd_units() -> None:
 
 def series(
     random: np.random.Generator, units: int, dates: int, *, again: float, slope: dict[int, float]
-) -> list[Series]:
+) -> list[DriftSeries]:
     """A bias of each unit at several dates: it comes out differently by `again` at each start."""
     found = []
     for at in range(units):
         days = np.sort(random.uniform(0.0, 90.0, dates))
         y = random.standard_normal() + slope.get(at, 0.0) * days + again * random.standard_normal(dates)
         found.append(
-            Series(at, "gz.bias", "deg/s", False, days, y + 0.01 * random.standard_normal(dates), np.full(dates, 0.01))
+            DriftSeries(
+                at, "gz.bias", "deg/s", False, days, y + 0.01 * random.standard_normal(dates), np.full(dates, 0.01)
+            )
         )
     return found
 

@@ -18,6 +18,7 @@ from scipy.stats import multivariate_normal
 from selfcal.adequacy.allan import relative_variance
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.model.laws import NAMED
@@ -25,8 +26,8 @@ from selfcal.studies import methods as registry
 from selfcal.studies.methods import RIVALS, particles, rao_blackwell
 from selfcal.studies.methods.autocorrelation import covariances
 from selfcal.studies.methods.dual import transition
-from selfcal.studies.methods.ensemble import summary
-from selfcal.studies.methods.problem import Floats, Problem, weights
+from selfcal.studies.methods.ensemble import ensemble_summary
+from selfcal.studies.methods.problem import Problem, weights
 from selfcal.studies.methods.recursive import update
 from selfcal.studies.methods.steady_state import ln_likelihood
 from selfcal.studies.methods.wavelets import covariance
@@ -140,7 +141,7 @@ def test_whittle_is_the_exact_likelihood_of_a_random_walk() -> None:
     power = fft.dct(posed.y - posed.y.mean(), norm="ortho")[1:] ** 2
     omega = math.pi * np.arange(1, 300) / 300
 
-    def ours(ln: Floats) -> float:
+    def ours(ln: Array) -> float:
         spectrum = posed.terms("random_walk", ln).spectrum(omega)
         return -0.5 * float((np.log(spectrum) + power / spectrum).sum())
 
@@ -175,7 +176,7 @@ def test_covariance_of_wavelet_moments(law: str) -> None:
     np.testing.assert_allclose(found, apart, rtol=1e-5)
 
 
-def arx(y: Floats, u: Floats, *, output_error: bool) -> tuple[Floats, Floats]:
+def arx(y: Array, u: Array, *, output_error: bool) -> tuple[Array, Array]:
     """a, b0, b1 of y[k] = -a y[k-1] + b0 u[k] + b1 u[k-1] and their covariance over the noise variance, by the rivals'
     recursive least squares. With `output_error` the model's own output stands in the place of the last reading, and the
     gradient is filtered by 1 + a z^-1."""
@@ -314,7 +315,7 @@ def test_errors_of_an_ensemble() -> None:
             weight = 0.8 if seed else 0.3
             row |= {"weight.Bayes.random_walk": weight, "weight.Bayes.gauss_markov": 1.0 - weight}
             rows.append(row)
-    entry = next(one for one in summary(rows, group) if one["rival"] == "library")
+    entry = next(one for one in ensemble_summary(rows, group) if one["rival"] == "library")
     assert entry["parameters"]["K"]["rmse_ln"] == pytest.approx(math.sqrt(0.05))
     assert entry["parameters"]["K"]["ratio"] == pytest.approx(math.sqrt(0.05) / 0.2)
     assert entry["parameters"]["K"]["coverage_90"] == 0.5

@@ -27,7 +27,7 @@ from selfcal.base.errors import UserError
 from selfcal.logs.framelog import LONGEST_LINE, FrameLog
 from selfcal.verbs.monitor import monitor
 from selfcal.wire.frames import Decoder
-from selfcal.wire.streams import McapLog, check
+from selfcal.wire.streams import McapLog, check_stream
 
 from conftest import CASE_RECORDS
 from wire_stream import AXES, lines, stream
@@ -232,7 +232,7 @@ def test_demo_is_streamed_whole(tmp_path: Path) -> None:
 )
 def test_wrong_streams_are_one_line(wanted: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--stream"):
-        check(wanted)
+        check_stream(wanted)
     for both in ({"stream": ["jsonl"], "json": "-"}, {"stream": ["ros:50", "jsonl"]}):
         with pytest.raises(UserError, match="both for stdout"):
             monitor(read=tmp_path / "x.log", **both)

@@ -16,9 +16,9 @@ import pytest
 from rich.console import Console
 
 from selfcal.adequacy.drawn import simulate_bank_samples
-from selfcal.adequacy.summary import Number, halved_after, summarize
+from selfcal.adequacy.summary import SheetNumber, halved_after, summarize
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult, Estimate
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.model.laws import PLAIN
@@ -37,7 +37,7 @@ def sharp(value: float) -> Estimate:
     return Estimate(value, value, 1e-6 * value, value * (1.0 - 1e-6), value * (1.0 + 1e-6), identified=True)
 
 
-def known(law: str, truth: Mapping[str, float], n: int = 20_000) -> dict[str, Number]:
+def known(law: str, truth: Mapping[str, float], n: int = 20_000) -> dict[str, SheetNumber]:
     """The numbers of a posterior that knows its law and parameters."""
     parameters = {name: {key: sharp(value) for key, value in truth.items()} if name == law else {} for name in PLAIN}
     probability = {name: float(name == law) for name in PLAIN}

@@ -29,10 +29,10 @@ from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
 from selfcal.calibration.earth import gravity_at, place
 from selfcal.calibration.gyroscope import Gyroscope
-from selfcal.calibration.noise import Noise, Term, drift
-from selfcal.calibration.rests import tumble_of
+from selfcal.calibration.noise import DriftTerm, Noise, drift
 from selfcal.calibration.tumble_export import FORMS
 from selfcal.calibration.tumble_plan import plan_of
+from selfcal.calibration.tumble_rests import tumble_of
 from selfcal.calibration.tumble_show import show
 from selfcal.logs.recording import Recording
 from selfcal.model.file import DEFAULT, Model
@@ -110,8 +110,8 @@ def test_normal_gravity(latitude: float, height: float, expected: float) -> None
     assert gravity_at(latitude, height) == pytest.approx(expected, abs=3e-7)
 
 
-@pytest.mark.parametrize("term", [Term(4e-4), Term(9e-4, 1.0 / 40.0)], ids=["walk", "markov"])
-def test_covariance_of_means(term: Term) -> None:
+@pytest.mark.parametrize("term", [DriftTerm(4e-4), DriftTerm(9e-4, 1.0 / 40.0)], ids=["walk", "markov"])
+def test_covariance_of_means(term: DriftTerm) -> None:
     """Against the double integral of the covariance of the drift since the reference time."""
     begin, end, reference = np.array([0.0, 20.0, 61.0]), np.array([13.0, 27.0, 80.0]), 83.0
 

@@ -46,12 +46,12 @@ def test_one_sided_density() -> None:
     ],
 )
 def test_values(value: float, unit: str, to: str, expected: float) -> None:
-    assert units.convert(value, unit, to) == pytest.approx(expected, rel=1e-14)
+    assert units.converted(value, unit, to) == pytest.approx(expected, rel=1e-14)
 
 
 def test_same_unit_is_exact() -> None:
     values = np.array([0.1, -7.3, 1e300])
-    assert np.array_equal(units.convert(values, "deg/s", "deg/s"), values)
+    assert np.array_equal(units.converted(values, "deg/s", "deg/s"), values)
 
 
 @pytest.mark.parametrize(
@@ -145,5 +145,5 @@ def test_no_unit_is_guessed(spelled: str) -> None:
 
 @pytest.mark.parametrize(("fahrenheit", "celsius"), [(32.0, 0.0), (212.0, 100.0), (-40.0, -40.0)])
 def test_fahrenheit(fahrenheit: float, celsius: float) -> None:
-    assert units.convert(fahrenheit, "degF", "degC") == pytest.approx(celsius, abs=1e-12)
-    assert units.convert(1000.0 * celsius, "mdegC", "degC") == pytest.approx(celsius, abs=1e-12)
+    assert units.converted(fahrenheit, "degF", "degC") == pytest.approx(celsius, abs=1e-12)
+    assert units.converted(1000.0 * celsius, "mdegC", "degC") == pytest.approx(celsius, abs=1e-12)

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from selfcal.adequacy.drawn import simulate_bank_samples
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult
 from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.base.units import duration_words
-from selfcal.batch.verdicts import CHANCE, FAIL, OPEN, PASS, UNJUDGED, Limits, judge
+from selfcal.batch.verdicts import CHANCE, FAIL, OPEN, PASS, UNJUDGED, Limits, judge_limits
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.model.tables import Tables, make_tables
@@ -91,7 +91,7 @@ def test_a_bound_decides(tmp_path: Path) -> None:
         ("gx.sigma_m: {max: 1 deg/s}", UNJUDGED),
         ("gy.N: {max: 1 deg/s/sqrt(Hz)}", UNJUDGED),
     ):
-        (verdict,) = judge(limits(tmp_path, text).of({"gx"}), {"gx": axis}, 600.0)
+        (verdict,) = judge_limits(limits(tmp_path, text).of({"gx"}), {"gx": axis}, 600.0)
         assert verdict.verdict == expected, text
 
 
@@ -112,7 +112,10 @@ def test_what_the_drift_has(tmp_path: Path) -> None:
         }
         for value, verdict in zip((4e-4, 2e-4, 1e-5), expected, strict=True):
             text = f"gx.K: {{max: {value} deg/s^2/sqrt(Hz)}}"
-            assert judge(limits(tmp_path, text).of({"gx"}), {"gx": axis}, 600.0)[0].verdict == verdict, (laws, value)
+            assert judge_limits(limits(tmp_path, text).of({"gx"}), {"gx": axis}, 600.0)[0].verdict == verdict, (
+                laws,
+                value,
+            )
 
 
 def test_the_rest_that_is_asked_for_suffices(tmp_path: Path) -> None:
@@ -136,12 +139,12 @@ def test_the_rest_that_is_asked_for_suffices(tmp_path: Path) -> None:
         name = "K" if seed % 2 else "N"
         limit = K * value if name == "K" else N * value**0.15
         stated = limits(tmp_path, f"gx.{name}: {{max: {limit} {units.parameter_unit(name, UNIT)}}}").of({"gx"})
-        verdict = judge(stated, {"gx": first}, base_s)[0]
+        verdict = judge_limits(stated, {"gx": first}, base_s)[0]
         if verdict.verdict != OPEN or verdict.more_s is None or base_s + verdict.more_s > longest_s:
             continue
         asked += 1
         second = look(tables, y[: int(base_s + verdict.more_s)])
-        told += judge(stated, {"gx": second}, base_s + verdict.more_s)[0].verdict in (PASS, FAIL)
+        told += judge_limits(stated, {"gx": second}, base_s + verdict.more_s)[0].verdict in (PASS, FAIL)
     print(f"{told} of {asked} have a verdict after the rest")
     assert abs(told / asked - CHANCE) <= 3.0 * math.sqrt(CHANCE * (1.0 - CHANCE) / asked)
 

@@ -13,7 +13,7 @@ import pytest
 from selfcal.base.errors import UserError
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.model.file import Model
-from selfcal.model.simulated_parts import SHEET_N, TURN_ON, simulate
+from selfcal.model.simulated_parts import SHEET_N, TURN_ON, simulate_axis
 from selfcal.studies.worth import (
     CORNER_HZ,
     LAST_S,
@@ -33,7 +33,7 @@ SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
 
 def test_the_other_ways_by_hand() -> None:
     """Each filter as a loop over the readings."""
-    y, _ = simulate("random_walk", 60, 3)
+    y, _ = simulate_axis("random_walk", 60, 3)
     found, sd = predictions(Model.load(), "gx", y)
     assert {name: set(bias) for name, bias in found.items() if name in ("none", "rest", "last")} == {
         "none": {0.0},
@@ -58,7 +58,7 @@ def test_the_other_ways_by_hand() -> None:
 
 def test_simulated_readings_have_their_law() -> None:
     """Over 400 parts: the turn-on bias, and the white noise about the bias; a share of 400 has an sd of 3.5 %."""
-    pairs = [simulate("gauss_markov", 50, seed) for seed in range(400)]
+    pairs = [simulate_axis("gauss_markov", 50, seed) for seed in range(400)]
     assert np.std([bias[0] for _, bias in pairs]) == pytest.approx(TURN_ON["deg/s"], rel=0.15)
     assert np.std([y - bias for y, bias in pairs]) == pytest.approx(0.04, rel=0.03)
     drift = np.array([bias - bias.mean() for _, bias in pairs])

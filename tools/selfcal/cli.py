@@ -22,7 +22,7 @@ from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
 import selfcal
-from selfcal.base.ending import install, last_signal, leave
+from selfcal.base.ending import install_signals, last_signal, leave
 from selfcal.base.errors import UserError, called, printable
 from selfcal.base.options import Option
 
@@ -165,7 +165,7 @@ def _check_once(options: Sequence[Any], arguments: Sequence[str]) -> None:
 def main() -> NoReturn:
     """Entry point. Exit codes: 0, USER_ERROR with one line on stderr, 128 + its number after a signal (Ctrl-C: 130); a
     traceback is our bug."""
-    install()
+    install_signals()
     # The matrices are small, and axes run side by side: threads of one product wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not sys.warnoptions:  # a library's warnings are not for the user

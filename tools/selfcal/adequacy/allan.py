@@ -17,31 +17,28 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import gammaincinv, ndtri
 
+from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.bank.blocks import Blocks
-from selfcal.bank.result import HALF_90, AxisResult, Estimate
-from selfcal.base.grid import SLOPE_STEP, bisected
+from selfcal.base.grid import SLOPE_STEP, Array, Mask, Rows, bisected
 from selfcal.model.file import Group
-from selfcal.model.laws import FORGOTTEN, KINDS, Law, named
+from selfcal.model.laws import FORGOTTEN, KINDS, Law, named_law
 from selfcal.model.tables import Tables
 
-_Floats = NDArray[np.float64]
-
 #: Least length of a record over its longest averaging time: fewer windows say little.
-LONGEST = 5
+AVERAGES_LEAST = 5
 #: Least share of a variance S that S - V keeps: nearly equal numbers have a small difference.
 LEFT_LEAST = 0.2
 #: Number of draws of a posterior.
-DRAWS = 256
+CURVE_DRAWS = 256
 #: Averaging times of a curve in an octave.
 PER_OCTAVE = 4
 
 
 @dataclass(frozen=True)
-class Terms:
+class AllanTerms:
     """A law at one value of its parameters, per reading: the white noise's `variance` and its correlation `lag1` with
     the reading before, the variance of the walk's `step`, and each Gauss-Markov drift's variance and its bandwidth
     times the interval between readings. An oscillation is the real part of one whose numbers are complex. `lacking`:
@@ -53,7 +50,7 @@ class Terms:
     markov: tuple[tuple[complex, complex], ...] = ()
     lacking: float = 0.0
 
-    def sums(self, j: _Floats) -> _Floats:
+    def sums(self, j: Array) -> Array:
         """G at the distances `j`, whole or not."""
         j = np.abs(j)
         total = -0.5 * (self.variance - self.lacking) * j + self.step / 12.0 * (j**3 - j)
@@ -64,11 +61,11 @@ class Terms:
             total = total - (variance / left * (phi / left * np.expm1(-alpha * j) + 0.5 * (1.0 + phi) * j)).real
         return np.asarray(total)
 
-    def allan_variance(self, m: _Floats) -> _Floats:
+    def allan_variance(self, m: Array) -> Array:
         """Allan variance at `m` readings."""
         return np.asarray((3.0 * self.sums(0.0 * m) - 4.0 * self.sums(m) + self.sums(2.0 * m)) / m**2)
 
-    def covariance(self, m: int, lags: int) -> _Floats:
+    def covariance(self, m: int, lags: int) -> Array:
         """Cov(u_k, u_(k+j)) for j = 0 to `lags` - 1."""
         near = np.arange(min(lags, 2 * m + 2), dtype=float)
         weights = {0: 6.0, m: -4.0, -m: -4.0, 2 * m: 1.0, -2 * m: 1.0}
@@ -80,7 +77,7 @@ class Terms:
             far -= (scale * np.exp(-alpha * (j - 2 * m))).real
         return np.concatenate([nearby, far])
 
-    def spectrum(self, omega: _Floats) -> _Floats:
+    def spectrum(self, omega: Array) -> Array:
         """Power of the readings at `omega` rad a reading; white noise of variance 1 has 1."""
         step = 4.0 * np.sin(0.5 * omega) ** 2  # |1 - e^(i omega)|^2
         power = self.variance * (1.0 + self.lag1 * (2.0 - step)) - self.lacking + self.step / step
@@ -89,12 +86,12 @@ class Terms:
         return np.asarray(power)
 
 
-def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> Terms:
+def allan_terms(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> AllanTerms:
     """A law at `parameters` (continuous time, units.py), for readings every `dt_s`, means of `block` samples."""
     drift, second = law.node(parameters)
     variance, lag1 = law.noise(parameters["N"] ** 2 / dt_s, second)
     terms = [KINDS[term.kind].averages(term, dt_s, block) for term in law.sized(drift, second)]
-    return Terms(
+    return AllanTerms(
         variance,
         lag1,
         sum(step for step, _, _ in terms),
@@ -103,7 +100,7 @@ def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int 
     )
 
 
-def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
+def overlapping_variance(y: Array, m: int) -> tuple[float, Mask]:
     """Allan variance of readings `y` at `m` of them, over all windows without a missing (NaN) reading; and which
     windows these are [n - 2 m + 1]. NaN without a window."""
     missing = np.isnan(y)
@@ -114,7 +111,7 @@ def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
     return (0.5 * float((u**2).mean()) if u.size else math.nan), whole
 
 
-def relative_variance(terms: Terms, m: int, whole: NDArray[np.bool_]) -> float:
+def relative_variance(terms: AllanTerms, m: int, whole: Mask) -> float:
     """Variance of the overlapping Allan variance over windows `whole`, over its mean squared, under `terms`: normal
     readings have Var = 2 / M^2 sum of Cov(u_k, u_l)^2 / 4."""
     count = int(whole.sum())
@@ -131,34 +128,34 @@ def relative_variance(terms: Terms, m: int, whole: NDArray[np.bool_]) -> float:
 
 
 @dataclass(frozen=True)
-class Fit:
+class AllanFit:
     """The curve of a law whose parameters were estimated from a record, at `m` [t] readings: `allan_variance` [t] at
     the estimate, the `variance` [t] of its logarithm, and the `covariance` [d, d] of the logarithms of the parameters.
     `terms_at`: the terms at other logarithms of the parameters."""
 
-    terms_at: Callable[[_Floats], Terms]
-    terms: Terms
-    allan_variance: _Floats
-    variance: _Floats
-    covariance: _Floats
+    terms_at: Callable[[Array], AllanTerms]
+    terms: AllanTerms
+    allan_variance: Array
+    variance: Array
+    covariance: Array
 
-    def drawn(self, draws: Mapping[str, _Floats]) -> Iterable[Terms]:
+    def drawn(self, draws: Mapping[str, Array]) -> Iterable[AllanTerms]:
         """The terms at each draw [k] of the parameters."""
         return map(self.terms_at, np.log(np.column_stack([*draws.values()])))
 
 
-def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[_Floats], Terms]:
+def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[Array], AllanTerms]:
     """The terms of a law at given ln parameters. `white` multiplies the white noise's variance."""
 
-    def terms_at(ln_theta: _Floats) -> Terms:
+    def terms_at(ln_theta: Array) -> AllanTerms:
         theta = dict(zip(of.parameters, np.exp(ln_theta).tolist(), strict=True))
-        terms = terms_of(of, theta, dt_s, block)
+        terms = allan_terms(of, theta, dt_s, block)
         return replace(terms, variance=terms.variance * white)
 
     return terms_at
 
 
-def _slopes(terms_at: Callable[[_Floats], Terms], ln_theta: _Floats, of: Callable[[Terms], _Floats]) -> _Floats:
+def _slopes(terms_at: Callable[[Array], AllanTerms], ln_theta: Array, of: Callable[[AllanTerms], Array]) -> Array:
     """Derivatives [d, t] of the logarithm of a curve `of` terms [t] in each ln parameter."""
     steps = np.eye(ln_theta.size) * SLOPE_STEP
     sides = [(of(terms_at(ln_theta + step)), of(terms_at(ln_theta - step))) for step in steps]
@@ -167,7 +164,7 @@ def _slopes(terms_at: Callable[[_Floats], Terms], ln_theta: _Floats, of: Callabl
 
 def information_of(
     of: Law, parameters: Mapping[str, float], dt_s: float, n: float, white: float = 1.0, block: int = 1
-) -> _Floats:
+) -> Array:
     """Information [d, d] of `n` readings every `dt_s` on ln of each parameter.
 
     Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum."""
@@ -184,11 +181,11 @@ def fit_of(
     group: Group,
     dt_s: float,
     n: float,
-    m: _Floats,
+    m: Array,
     white: float = 1.0,
     *,
     block: int,
-) -> Fit:
+) -> AllanFit:
     """The curve at `parameters` that `n` readings have determined, with the group's priors. `white` multiplies the
     white noise's variance. A reading is the mean of `block` samples."""
     of = group.laws[law]
@@ -199,12 +196,12 @@ def fit_of(
     jacobian = _slopes(terms_at, ln_estimate, lambda terms: terms.allan_variance(m))
     variance = np.asarray(np.einsum("dt,de,et->t", jacobian, covariance, jacobian))
     terms = terms_at(ln_estimate)
-    return Fit(terms_at, terms, terms.allan_variance(m), variance, np.asarray(covariance, np.float64))
+    return AllanFit(terms_at, terms, terms.allan_variance(m), variance, np.asarray(covariance, np.float64))
 
 
-def lengths(n: int, per_octave: int = 1) -> NDArray[np.int64]:
+def lengths(n: int, per_octave: int = 1) -> Rows:
     """2 readings, twice as many and so on to a fifth of `n`, and with `per_octave` some between."""
-    octaves = math.log2(n / (2 * LONGEST)) if n > 2 * LONGEST else -1.0
+    octaves = math.log2(n / (2 * AVERAGES_LEAST)) if n > 2 * AVERAGES_LEAST else -1.0
     return np.unique(
         np.rint(2.0 ** (1.0 + np.arange(math.floor(octaves * per_octave) + 1) / per_octave)).astype(np.int64)
     )
@@ -225,7 +222,7 @@ def ratio_at(deviations: float, variance: float) -> float:
 
 
 @dataclass(frozen=True)
-class Curve:
+class AllanCurve:
     """Allan deviation of a record of bank readings, and of a law that was identified from it, at `tau_s` [t], s.
 
     `recording` [t] with its `freedom`, the equivalent degrees of freedom of its square under the law; `model` [t] at
@@ -234,22 +231,22 @@ class Curve:
     being the variance of the logarithm of their ratio.
     """
 
-    tau_s: _Floats
-    recording: _Floats
-    freedom: _Floats
-    model: _Floats
-    model_q05: _Floats
-    model_q95: _Floats
-    octave: NDArray[np.bool_]
-    deviations: _Floats
-    left: _Floats
+    tau_s: Array
+    recording: Array
+    freedom: Array
+    model: Array
+    model_q05: Array
+    model_q95: Array
+    octave: Mask
+    deviations: Array
+    left: Array
 
-    def within(self, deviations: float) -> _Floats:
+    def within(self, deviations: float) -> Array:
         """The record's Allan deviation [t] if it were so many standard deviations above the model's."""
         return self.model * np.sqrt([ratio_at(deviations, variance) for variance in self.left.tolist()])
 
 
-def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -> Curve | None:
+def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -> AllanCurve | None:
     """The means of `blocks` (NaN: missing), compared with the most probable law at its posterior medians.
 
     None if there are too few readings.
@@ -267,10 +264,10 @@ def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -
     if 0 < memory < y.size:
         y, shared = y[-memory:], 1.0 - 2.0 * math.exp(-2.0)
     n = int(np.isfinite(y).sum())
-    if n < 2 * LONGEST:
+    if n < 2 * AVERAGES_LEAST:
         return None
     y = y - float(np.nanmean(y))
-    rows = [(int(m), *overlapping(y, int(m))) for m in lengths(n, PER_OCTAVE)]
+    rows = [(int(m), *overlapping_variance(y, int(m))) for m in lengths(n, PER_OCTAVE)]
     rows = [entry for entry in rows if int(entry[2].sum()) >= entry[0]]  # gaps leave too few windows
     m = np.array([entry[0] for entry in rows], float)
     recorded = np.array([entry[1] for entry in rows])
@@ -282,7 +279,7 @@ def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -
     ratio = recorded / fit.allan_variance
     curves = [terms.allan_variance(m) for terms in fit.drawn(posterior_draws(estimates, fit.covariance))]
     low, high = np.sqrt(np.quantile(curves, [0.05, 0.95], axis=0)) if m.size else (m, m)
-    return Curve(
+    return AllanCurve(
         m * dt_s,
         np.sqrt(recorded),
         2.0 / own,
@@ -295,15 +292,15 @@ def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -
     )
 
 
-def posterior_draws(estimates: Mapping[str, Estimate], covariance: _Floats) -> dict[str, _Floats]:
-    """Values [DRAWS] of each parameter of a law: its own median and quantiles, and between parameters the correlation
-    of `covariance` [d, d], of their logarithms. The draws are evenly spread, not random (an additive recurrence:
-    Roberts 2018), so that quantiles of functions of them are smooth."""
+def posterior_draws(estimates: Mapping[str, Estimate], covariance: Array) -> dict[str, Array]:
+    """Values [CURVE_DRAWS] of each parameter of a law: its own median and quantiles, and between parameters the
+    correlation of `covariance` [d, d], of their logarithms. The draws are evenly spread, not random (an additive
+    recurrence: Roberts 2018), so that quantiles of functions of them are smooth."""
     chosen = list(estimates.values())
     sd = np.sqrt(np.diag(covariance))
     d = len(chosen)
     root, _ = bisected(lambda x: x ** (d + 1) >= x + 1.0, 1.0, 2.0)
-    even = (0.5 + np.outer(np.arange(1, DRAWS + 1), root ** -np.arange(1.0, d + 1))) % 1.0
+    even = (0.5 + np.outer(np.arange(1, CURVE_DRAWS + 1), root ** -np.arange(1.0, d + 1))) % 1.0
     z = ndtri(even) @ np.linalg.cholesky(covariance / np.outer(sd, sd)).T
     middle = np.log([e.median for e in chosen])
     up = (np.log([e.q95 for e in chosen]) - middle) / HALF_90
@@ -316,19 +313,19 @@ def posterior_draws(estimates: Mapping[str, Estimate], covariance: _Floats) -> d
 class Sampled:
     """Overlapping Allan deviation of a recording's own samples at `tau_s` [t], s, with its 90 % interval."""
 
-    tau_s: _Floats
-    deviation: _Floats
-    q05: _Floats
-    q95: _Floats
+    tau_s: Array
+    deviation: Array
+    q05: Array
+    q95: Array
 
 
-def sample_lengths(n: int, block: int) -> NDArray[np.int64]:
+def sample_lengths(n: int, block: int) -> Rows:
     """1 of `n` samples, 2, 4 ... to two bank intervals of `block` samples, and from there in octaves of these."""
     short = 2 ** np.arange(math.ceil(math.log2(2 * block)), dtype=np.int64)
     return np.concatenate([short, block * lengths(n // block)])
 
 
-def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, m: NDArray[np.int64]) -> Sampled:
+def sampled(values: Array, missing_before: Rows, rate_hz: float, m: Rows) -> Sampled:
     """At `m` samples. `values` [n], NaN where a sample is not used, after `missing_before` [n] missing
     ones each.
 
@@ -338,7 +335,7 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
     values = values.astype(np.float64)  # its sums of 10^6 and more readings in float32 are off by 1e-4 and more
     n = int(np.isfinite(values).sum())
     parted = np.insert(values - np.nanmean(values), np.flatnonzero(missing_before), np.nan)
-    each = (overlapping(parted, length) for length in m.tolist())  # a mask of all samples each: one at a time
+    each = (overlapping_variance(parted, length) for length in m.tolist())  # a mask of all samples each: one at a time
     variance, count = np.array([(value, whole.sum()) for value, whole in each]).T
     kept = (variance > 0.0) & (count >= m)
     m, deviation = m[kept], np.sqrt(variance[kept])
@@ -352,10 +349,10 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
 def freedom_of(power: float, m: int, n: int) -> float:
     """Equivalent degrees of freedom of the overlapping Allan variance at `m` of `n` readings, as Greenhall & Riley
     (2003) define them, of noise whose variance goes as tau^`power`: -1 white, 0 flicker, 1 a walk."""
-    flicker = named("flicker")
+    flicker = named_law("flicker")
     terms = {
-        -1.0: Terms(1.0),
-        0.0: terms_of(flicker, {"N": 0.0, "B": 1.0, "alpha": 1.0 / m}, 1.0),
-        1.0: Terms(0.0, step=1.0),
+        -1.0: AllanTerms(1.0),
+        0.0: allan_terms(flicker, {"N": 0.0, "B": 1.0, "alpha": 1.0 / m}, 1.0),
+        1.0: AllanTerms(0.0, step=1.0),
     }
     return 2.0 / relative_variance(terms[power], m, np.ones(n - 2 * m + 1, np.bool_))

@@ -8,22 +8,22 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from selfcal.adequacy.allan import LEFT_LEAST, Curve, curve_of, ratio_at, terms_of
-from selfcal.bank.blocks import FEWEST, MOST_DENSE, Blocks
+from selfcal.adequacy.allan import LEFT_LEAST, AllanCurve, allan_terms, curve_of, ratio_at
+from selfcal.bank.axis_result import AxisResult, Estimate
+from selfcal.bank.blocks import BLOCKS_LEAST, MOST_DENSE, Blocks
 from selfcal.bank.priors import rounded
-from selfcal.bank.result import AxisResult, Estimate
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
+from selfcal.base.grid import Array, Rows
 from selfcal.logs.recording import Recording
-from selfcal.logs.sampling import CHANGE
+from selfcal.logs.sampling import RATE_CHANGE_LEAST
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
 from selfcal.readings.budget import CHECK_LIMIT, FALSE_ALARM
+from selfcal.readings.faults import FAULTS
 from selfcal.readings.readings import Readings
-from selfcal.readings.tests import TESTS
 
 #: Largest distance of a part from its batch that passes, sd: the two parameters of a law share FALSE_ALARM.
 BATCH_LIMIT = -float(ndtri(0.25 * FALSE_ALARM))
@@ -31,7 +31,7 @@ BATCH_LIMIT = -float(ndtri(0.25 * FALSE_ALARM))
 #: 0.9, where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
 HIDDEN_MOST = 0.84
 #: Length of an average over a filter's time constant: it shows N before a first-order filter to 5 %.
-CORNERS = 10.0
+CORNER_LENGTH = 10.0
 #: Largest spacing of float32 in the noise of a reading: beyond it N is 0.4 % too large.
 SPACING_MOST = 0.3
 
@@ -42,10 +42,10 @@ class Judged:
     its Allan deviation, None where the record is too short, or too long."""
 
     checks: Mapping[str, Mapping[str, Any]]
-    curve: Curve | None
+    curve: AllanCurve | None
 
 
-def judge(
+def judge_record(
     blocks: Blocks,
     tables: Tables,
     group: Group,
@@ -61,7 +61,7 @@ def judge(
     sound = all(math.isfinite(estimate.median) for estimate in result.parameters[result.best].values())
     if blocks.mean.size > MOST_DENSE or not sound:
         return Judged({}, None)
-    if int(np.isfinite(blocks.mean).sum()) < FEWEST + len(used):
+    if int(np.isfinite(blocks.mean).sum()) < BLOCKS_LEAST + len(used):
         return Judged({}, None)
     left = blocks
     if used:
@@ -82,18 +82,13 @@ def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
     if tables.block == 1:
         return {}
     medians = {name: estimate.median for name, estimate in result.parameters[result.best].items()}
-    terms = terms_of(group.laws[result.best], medians, tables.dt_s, tables.block)
+    terms = allan_terms(group.laws[result.best], medians, tables.dt_s, tables.block)
     share = terms.lacking / (terms.variance * (1.0 - 2.0 * terms.lag1))
     return {"drift_in_average": {"value": share, "limit": HIDDEN_MOST, "passed": share <= HIDDEN_MOST}}
 
 
 def with_rate(
-    judged: Judged,
-    values: NDArray[np.float64],
-    missing_before: NDArray[np.int64],
-    step: float,
-    tables: Tables,
-    result: AxisResult,
+    judged: Judged, values: Array, missing_before: Rows, step: float, tables: Tables, result: AxisResult
 ) -> Judged:
     """The same with the rates of a `drift_in_average` that failed: `bank_hz`, and `decimate_hz` of averages that show
     the white noise.
@@ -105,7 +100,7 @@ def with_rate(
     """  # fmt: skip
     near = missing_before[1:] == 0
 
-    def square(differences: NDArray[np.float64]) -> float:
+    def square(differences: Array) -> float:
         pairs = int(np.isfinite(differences).sum())
         return float(np.nansum(differences**2)) / max(1, pairs) - step**2 / 6.0
 
@@ -117,8 +112,8 @@ def with_rate(
     if white > walk:
         alike_hz = rate_hz * math.sqrt(max(walk, 0.0) / white)
         rates["decimate_hz"] = rounded(min(rate_hz, max(2.0 / tables.dt_s, alike_hz)))
-    elif alpha is not None and values.size * alpha.median > FEWEST * CORNERS * rate_hz:
-        rates["decimate_hz"] = rounded(alpha.median / CORNERS)
+    elif alpha is not None and values.size * alpha.median > BLOCKS_LEAST * CORNER_LENGTH * rate_hz:
+        rates["decimate_hz"] = rounded(alpha.median / CORNER_LENGTH)
     return replace(judged, checks={**judged.checks, "drift_in_average": {**judged.checks["drift_in_average"], **rates}})
 
 
@@ -158,7 +153,7 @@ def with_readings(
     `lattice`, if they lie on one: is their noise above it, or carried on to the next reading? `value`: steps in the
     noise of a reading; `step` in the recording's unit; `distinct` readings; of a counter that fails `counter_hz`: the
     rate of means whose remainders are white.
-    The tests of the readings (readings/tests.py), if they name something: the share of readings that it is about.
+    Faults of the readings (readings/faults.py), if there are any: the share of readings that each is about.
     `misread` has its `kind`, whether it is `undone`, and kinds that are `also_possible`, `saturation` the `at` of the
     limit, `outliers` the value `at` which they recur, `stuck` and `motion` their `intervals` in s. `motion` passes
     where the noise of averages is the same with it, within its own scatter.
@@ -183,14 +178,14 @@ def with_readings(
             "intervals": [[a + start_s, b + start_s] for a, b in readings.moved.intervals] if readings.moved else [],
         },
     }
-    for test in TESTS:
-        if test.statistic(readings) > 0.0:
-            outcome = {"value": float(np.mean(test.mask(readings))), "limit": 0.0, "passed": False}
-            checks[test.name] = {**outcome, **more.get(test.name, dict)()}
+    for fault in FAULTS:
+        if fault.statistic(readings) > 0.0:
+            outcome = {"value": float(np.mean(fault.mask(readings))), "limit": 0.0, "passed": False}
+            checks[fault.name] = {**outcome, **more.get(fault.name, dict)()}
     if as_fed:
         if readings.changes:
             ratio = max((change.after_hz / change.before_hz - 1.0 for change in readings.changes), key=abs)
-            checks["rate_change"] = {"value": ratio, "limit": CHANGE, "passed": False}
+            checks["rate_change"] = {"value": ratio, "limit": RATE_CHANGE_LEAST, "passed": False}
         if readings.coarse > SPACING_MOST:
             checks["float_spacing"] = {"value": readings.coarse, "limit": SPACING_MOST, "passed": False}
     return replace(judged, checks={**judged.checks, **checks})
@@ -207,12 +202,12 @@ def against(checks: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     return dict(sorted(sure.items(), key=lambda item: -item[1]))
 
 
-def coefficients_of(result: AxisResult) -> NDArray[np.float64]:
+def coefficients_of(result: AxisResult) -> Array:
     """Posterior means [p] of the coefficients of the columns in use, under the most probable law."""
     return np.array([mean for mean, _ in result.coefficients[result.best]])
 
 
-def allan_checks(curve: Curve) -> dict[str, dict[str, Any]]:
+def allan_checks(curve: AllanCurve) -> dict[str, dict[str, Any]]:
     """Is the record's Allan deviation the model's, at averaging times of 2, 4, 8 ... bank intervals to a fifth of the
     record? `value` is the model's deviation over the record's less 1, `limit` how far on this side it may be, and
     `deviations` by how many standard deviations the record's variance is above the model's.
@@ -231,7 +226,7 @@ def allan_checks(curve: Curve) -> dict[str, dict[str, Any]]:
     return checks
 
 
-def allan_limit(curve: Curve) -> float:
+def allan_limit(curve: AllanCurve) -> float:
     """How many standard deviations an averaging time may be off. All together fail as often as one other check
     (CHECK_LIMIT): a single one counts as outside beyond the limit that makes this so (Bonferroni's). Once one is, every
     one beyond CHECK_LIMIT is named."""

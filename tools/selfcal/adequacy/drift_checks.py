@@ -14,15 +14,14 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.blocks import Blocks
-from selfcal.bank.result import AxisResult
 from selfcal.base.errors import UserError
-from selfcal.base.grid import block_means, half_means
+from selfcal.base.grid import Array, block_means, half_means
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.columns import LN_SLOW, SMALLER, Shape
-from selfcal.likelihood.fit import ROUGH_FTOL, finish
+from selfcal.likelihood.fit import ROUGH_FTOL, fit_at
 from selfcal.likelihood.state import MEANS_MOST, NET_LEAST, SCREEN, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import formed, slope, variance_of
 from selfcal.model.tables import Tables
@@ -30,13 +29,13 @@ from selfcal.readings.budget import CLEARLY
 
 #: Sizes of the drift that are tried with a column, as ln of a divisor. A smaller one must be clearly better: noise that
 #: axes share is no drift.
-SIZES = (0.0, 0.7, *SMALLER)
+DRIFT_DIVISORS = (0.0, 0.7, *SMALLER)
 #: Fewest means that are looked at: fewer show no drift.
-FEWEST = 60
+MEANS_LEAST = 60
 #: Smoothing, lags and the window of a rate, s: a channel's own noise hides its slow change.
 SMOOTH_S, LAGS_S, RATE_S = 20.0, (5.0, 30.0, 120.0, 600.0), 60.0
 #: Time constants of a settling, shares of the record.
-SETTLING = (0.005, 0.015, 0.05, 0.15)
+SETTLING_SHARES = (0.005, 0.015, 0.05, 0.15)
 
 
 def drift_checks(
@@ -49,7 +48,7 @@ def drift_checks(
     likeliest = max(result.probability, key=lambda law: result.probability[law])
     simple = any(not hypothesis.law.is_sum and hypothesis.name == likeliest for hypothesis in tables.hypotheses)
     state, cells = _state(blocks, tables)
-    if np.isfinite(state.y).sum() < FEWEST or not simple:
+    if np.isfinite(state.y).sum() < MEANS_LEAST or not simple:
         return {}
     try:
         state = state.refit(ftol=ROUGH_FTOL)
@@ -59,12 +58,12 @@ def drift_checks(
     channels = list(_channels(state, blocks.begin, tables.block * cells, recording, others))
     if channels:
         checks["channel"] = _check(state, channels, lambda best: dict(best.stated))
-    settling = [share * state.y.size for share in SETTLING]
+    settling = [share * state.y.size for share in SETTLING_SHARES]
     decays = {tau * state.dt: np.exp(-np.arange(state.y.size) / tau) for tau in settling}
     shapes = [_shape(f"{tau:g}", column, len(decays), tau_s=tau) for tau, column in decays.items()]
     checks["turn_on"] = _check(state, shapes, lambda best: dict(best.stated))
     steps = edges.scan(state.series, state.best)
-    rows = steps.peaks(3, edges.SHORTEST)
+    rows = steps.peaks(3, edges.EDGES_APART)
     begin_s = recording.start_s + blocks.begin / recording.rate_hz
     jumps = [replace(edges.shape(state, "step", (row,), steps), form=f"{row}") for row in rows]
     checks["jump"] = _check(state, jumps, lambda best: {"time_s": begin_s + (best.when or (0.0,))[0]}, drift=False)
@@ -81,9 +80,9 @@ def _check(
     shape, worth = (shapes[0], 0.0) if best is None else (best.shape, best.net)
     if worth > NET_LEAST and drift:
         full, *smaller = (
-            max(float(state.scores([shape.columns], fit.shrunk(by))[0]) for fit in state.fits) for by in SIZES
+            max(float(state.scores([shape.columns], fit.shrunk(by))[0]) for fit in state.fits) for by in DRIFT_DIVISORS
         )
-        none = finish(state.series, state.best.terms, state.best.shrunk(1e3).theta)  # within its limits
+        none = fit_at(state.series, state.best.terms, state.best.shrunk(1e3).theta)  # within its limits
         drifts = state.best.ln_likelihood > none.ln_likelihood + CLEARLY
         worth = worth if drifts and max(smaller) > full + CLEARLY else 0.0
     passed = {"value": worth, "limit": NET_LEAST, "passed": worth <= NET_LEAST, "deviations": math.sqrt(2.0 * worth)}

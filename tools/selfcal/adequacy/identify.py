@@ -11,15 +11,16 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.adequacy.allan import Sampled, sample_lengths, sampled
-from selfcal.adequacy.checks import against, coefficients_of, judge, with_rate, with_readings
+from selfcal.adequacy.checks import against, coefficients_of, judge_record, with_rate, with_readings
 from selfcal.adequacy.counted import weigh_counted
-from selfcal.adequacy.document import Identified
+from selfcal.adequacy.identify_document import Identified
 from selfcal.adequacy.one_over_f import Rerun, weigh, with_white
 from selfcal.adequacy.summary import halved_after, summarize
+from selfcal.bank.axis_result import AxisResult, in_unit
 from selfcal.bank.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
-from selfcal.bank.result import AxisResult, in_unit
-from selfcal.bank.subsets import Scored, combine
+from selfcal.bank.subsets import ScoredSubsets, combine
 from selfcal.base.errors import OutsidePriors, UserError
+from selfcal.base.grid import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float, check_column
 from selfcal.model.file import Group, Model, Regressor
 from selfcal.model.regressors import choices_of, columns_of, mask_of, offered
@@ -96,7 +97,7 @@ def concluded(
     mask: int,
     inside: AxisResult,
     answer: AxisResult,
-    scored: Scored | None,
+    scored: ScoredSubsets | None,
     *,
     draw: bool = False,
     as_fed: bool = False,
@@ -106,7 +107,7 @@ def concluded(
     engine took every reading."""
     group, tables, readings = fed.group, fed.tables, fed.readings
     means, used = (tables.dt_s, fed.blocks.mean.size, tables.block), _used(mask)
-    judged = judge(fed.blocks, tables, group, result, fed.recording, others, used)
+    judged = judge_record(fed.blocks, tables, group, result, fed.recording, others, used)
     if "drift_in_average" in against(judged.checks):
         step = 0.0 if readings.lattice is None else readings.lattice.step
         judged = with_rate(judged, fed.used, fed.recording.missing_before, step, tables, result)
@@ -151,11 +152,11 @@ class Fed:
         return choices_of(self.regressors)
 
     @property
-    def used(self) -> NDArray[np.float64]:
+    def used(self) -> Array:
         """The samples [n], NaN where the engine takes none."""
         return np.where(np.logical_or.reduce(list(kept_out(self.samples, self.group).values())), np.nan, self.samples)
 
-    def curve(self, explained: NDArray[np.float64] | float) -> Sampled:
+    def curve(self, explained: Array | float) -> Sampled:
         """The Allan deviation of the samples less what is `explained` [n] of them."""
         values = self.used
         lengths = sample_lengths(int(np.isfinite(values).sum()), self.tables.block)
@@ -225,7 +226,7 @@ def _by_reference(fed: Fed, model: Model, advance: Callable[[], object]) -> list
         beside, law_sd = (z[:, used] if used else None), sd[used].tolist()
         ahead_s = blocks.after / fed.recording.rate_hz
         own = blocks.mean, tables.dt_s, fed.group, model.hypotheses, blocks.r
-        results.append(reference.identify_axis(*own, beside, law_sd, tables.block, ahead_s))
+        results.append(reference.reference_axis(*own, beside, law_sd, tables.block, ahead_s))
         advance()
     return results
 

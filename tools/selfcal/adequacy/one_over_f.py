@@ -18,29 +18,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.adequacy.allan import LONGEST, fit_of, posterior_draws, terms_of
+from selfcal.adequacy.allan import AVERAGES_LEAST, allan_terms, fit_of, posterior_draws
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.priors import MOST_INTERVALS, NARROW
-from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.model.file import ABOUT_N, MOST_HYPOTHESES, Group, Prior
 from selfcal.model.laws import NAMED
 from selfcal.model.tables import HypothesisTable, Tables, make_grid, priors_of
 
-_Floats = NDArray[np.float64]
-
 FLICKER = "flicker"
 #: Least probability of 1/f noise that is called sure. Of 40 records of an hour of a Gauss-Markov drift of 60 s, 0.3 N a
 #: root of a second, 5 reach 0.9 and none 0.97.
-SURE = 0.98
+SURE_PROBABILITY = 0.98
 #: Frequency at which the white noise is the rest of the spectrum, radians a bank interval.
 _OMEGA = 2.0 * math.pi / 3.0
 #: Least share of the law's own white noise that is left.
-_LEAST = 1e-3
+_WHITE_LEAST = 1e-3
 #: Nodes of rho and of alpha.
 _NODES = (24, 20)
 
 
-def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
+def density_above(alpha: Array, dt_s: float, block: int) -> Array:
     """[k], s: what 1/f noise of B = 1 has more than the law `flicker` of B = 1 and `alpha` [k] at a third of the bank's
     rate, in means of `block` readings every `dt_s`. The readings have nothing above half their own rate."""
     image = np.abs(_OMEGA + 2.0 * math.pi * np.arange(-block, block + 1))
@@ -49,17 +48,17 @@ def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
     whole = float((passed / image).sum())  # 1 / (2 pi f), f per interval
     law = NAMED[FLICKER]
     own = [
-        float(terms_of(law, {"N": 0.0, "B": 1.0, "alpha": bandwidth}, dt_s, block).spectrum(np.array(_OMEGA)))
+        float(allan_terms(law, {"N": 0.0, "B": 1.0, "alpha": bandwidth}, dt_s, block).spectrum(np.array(_OMEGA)))
         for bandwidth in alpha.tolist()
     ]
     return np.asarray(dt_s * (whole - np.array(own)))
 
 
-def white_of(draws: Mapping[str, _Floats], dt_s: float, block: int) -> _Floats:
+def white_beside(draws: Mapping[str, Array], dt_s: float, block: int) -> Array:
     """N [k] next to 1/f noise, of draws [k] of the parameters of the law `flicker`."""
     square = draws["N"] ** 2
     left = square - density_above(draws["alpha"], dt_s, block) * draws["B"] ** 2
-    return np.asarray(np.sqrt(np.maximum(left, _LEAST**2 * square)))
+    return np.asarray(np.sqrt(np.maximum(left, _WHITE_LEAST**2 * square)))
 
 
 def beside_its_law(parameters: Mapping[str, float], dt_s: float, block: int) -> float:
@@ -73,19 +72,19 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
     record is too short for it."""
     estimates = result.parameters.get(FLICKER, {})
     medians = {name: estimate.median for name, estimate in estimates.items()}
-    if not estimates or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
+    if not estimates or n < 2 * AVERAGES_LEAST or not all(math.isfinite(value) for value in medians.values()):
         return result
     fit = fit_of(FLICKER, medians, group, dt_s, n, np.ones(1), block=block)
     draws = posterior_draws(estimates, fit.covariance)
-    white = white_of(draws, dt_s, block)
+    white = white_beside(draws, dt_s, block)
     low, middle, high = np.quantile(white, (0.05, 0.5, 0.95)).tolist()
-    identified = estimates["N"].identified and low > 2.0 * _LEAST * medians["N"]
+    identified = estimates["N"].identified and low > 2.0 * _WHITE_LEAST * medians["N"]
     own = Estimate(float(white.mean()), middle, float(white.std()), low, high, identified, estimates["N"].off_grid)
     return replace(result, parameters={**result.parameters, FLICKER: {**estimates, "N": own}})
 
 
 @dataclass(frozen=True)
-class Beside:
+class AddedLaw:
     """A `law` added to a model's laws: its probability among them, and its posterior of `n` means over `block` samples,
     one every `dt_s`, under the priors of `group`."""
 
@@ -99,7 +98,7 @@ class Beside:
 
     def laws(self, probability: Mapping[str, float]) -> dict[str, float]:
         """The probabilities of all laws where this one is sure; else none."""
-        if self.probability < SURE:
+        if self.probability < SURE_PROBABILITY:
             return {}
         return {**{law: (1.0 - self.probability) * p for law, p in probability.items()}, self.law: self.probability}
 
@@ -118,7 +117,7 @@ class Rerun:
     offset: float = 0.0
 
 
-def weigh(rerun: Rerun) -> Beside | None:
+def weigh(rerun: Rerun) -> AddedLaw | None:
     """The law `flicker` with the prior odds of an average law of the tables. None where the tables have the law, no
     room for it, or no result."""
     tables, group, samples = rerun.tables, rerun.group, rerun.samples
@@ -133,7 +132,7 @@ def weigh(rerun: Rerun) -> Beside | None:
     return weigh_law(FLICKER, own, 1.0, replace(rerun, tables=tables))
 
 
-def weigh_law(name: str, priors: Mapping[str, Prior], odds: float, rerun: Rerun) -> Beside | None:
+def weigh_law(name: str, priors: Mapping[str, Prior], odds: float, rerun: Rerun) -> AddedLaw | None:
     """A named law of two drift parameters as weigh() has it, with `priors` of its own. `odds`: over an average law."""
     from selfcal.bank.library import Bank
 
@@ -155,4 +154,4 @@ def weigh_law(name: str, priors: Mapping[str, Prior], odds: float, rerun: Rerun)
         return None
     if not math.isfinite(result.probability[name]):
         return None
-    return Beside(result.probability[name], result.parameters[name], own, tables.dt_s, result.n, tables.block, name)
+    return AddedLaw(result.probability[name], result.parameters[name], own, tables.dt_s, result.n, tables.block, name)

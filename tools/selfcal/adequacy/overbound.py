@@ -14,19 +14,18 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
-_Floats = NDArray[np.float64]
+from selfcal.base.grid import Array
 
 
-def upper_limit(deviation: _Floats, freedom: _Floats, level: float) -> _Floats:
+def upper_limit(deviation: Array, freedom: Array, level: float) -> Array:
     """Upper limits [t] of the true Allan deviations with the probability `level`, each: measured `deviation` [t] with
     so many degrees of `freedom` [t], its square distributed as chi-square over them."""
     return np.asarray(deviation * np.sqrt(freedom / chdtri(freedom, level)))
 
 
-def overbound(tau_s: Sequence[_Floats], limit: Sequence[_Floats]) -> tuple[float, float]:
+def overbound(tau_s: Sequence[Array], limit: Sequence[Array]) -> tuple[float, float]:
     """N and K of the least area above all curves, one an axis: `limit` [t] at `tau_s` [t]. NaN without a point."""
     tau, square = np.concatenate([*tau_s, []]), np.concatenate([*limit, []]) ** 2
     if tau.size == 0:

@@ -1,7 +1,7 @@
 """`selfcal part`: the model file of another part, from a recording at rest, its data sheet, or both.
 
-`read_out` puts what a recording shows of its own read-out into a model file's tree. `diagnose --write-model` takes it
-as well.
+`put_read_out` puts what a recording shows of its own read-out into a model file's tree. `diagnose --write-model` takes
+it as well.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.adequacy.summary import NOISIER
+from selfcal.bank.axis_result import in_unit
 from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, NARROW, Seen, about, laid, prior_tree, rounded, seen_of
-from selfcal.bank.result import in_unit
 from selfcal.base import units as unit_module
 from selfcal.base.errors import UserError, note, remark, short
+from selfcal.base.grid import Array
 from selfcal.base.units import SENSORS, factor, parameter_unit
 from selfcal.logs.recording import Recording, check_column
 from selfcal.model.file import DEFAULT, LONGEST_TEXT, Model, Prior
 from selfcal.readings.lattice import step_of
-from selfcal.readings.readings import ROUNDED, Readings, look
+from selfcal.readings.readings import RANGE_ROUNDED, Readings, look
 from selfcal.readings.rest import rest_of
 
 #: Keys of a data sheet for a group or an axis, and for the part. `density` is one-sided, as data sheets have
@@ -36,7 +36,7 @@ STATED, OF_PART = ("N", "density", "K", "B", "bias", "range", "lsb"), ("rate",)
 #: Kinds of axes by a unit of each: their group's name, and its unit where the recording does not decide it.
 KINDS = {"rad/s": "gyro", "m/s^2": "accel", "T": "field", "Pa": "pressure", "degC": "temperature", "V": "voltage"}
 #: Largest ratio of a recording's rate to its sensor's.
-FASTER = 1.01
+FASTER_MOST = 1.01
 #: Least sd of the bias prior over N, of an axis of another kind, 1/sqrt(s).
 LEAST_BIAS = 1000.0
 
@@ -52,7 +52,7 @@ class Stated:
     text: str
 
 
-def parse(text: str) -> Stated:
+def parse_stated(text: str) -> Stated:
     """`gx.N=0.012deg/sqrt(h)`: an axis or a group and a dot, if it is of one alone; the key; the number; its unit."""
     match = re.fullmatch(r"\s*(?:(?P<of>[\w-]+)\.)?(?P<key>\w+)\s*=(?P<quantity>.*)", text)
     wanted = "write KEY=NUMBER and its unit, as N=0.012deg/sqrt(h), accel.N=70ug/sqrt(Hz) or rate=200Hz"
@@ -108,7 +108,7 @@ def of_recording(tree: dict[str, Any], recording: Recording) -> list[str]:
             longest = f": --start {rest.longest[0]:.10g} --end {rest.longest[1]:.10g}" if rest.longest else ""
             raise UserError(f"{recording.path}: {axis} moved; take a stretch at rest{longest}")
     readings = {axis: look(record, axis, model.group_of(axis)) for axis, record in own.items()}
-    said = [read_out(tree, model, readings)]
+    said = [put_read_out(tree, model, readings)]
     for group in model.groups:
         by_axis = {axis: _seen(own[axis], axis, model) for axis in group.axes}
         fields = tree["groups"][group.name]
@@ -144,15 +144,15 @@ def _seen(recording: Recording, axis: str, model: Model) -> Seen:
     return seen
 
 
-def read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Readings], *, stated: bool = False) -> str:
+def put_read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Readings], *, stated: bool = False) -> str:
     """Put rate, lattice, range and stuck limit that a recording shows into the `tree` of a model; a line on them.
 
     `readings`: of the axes that are looked at. `stated`: a user states the model's read-out. Then an entry stays that
     the readings do not contradict: those of a log that averages its sensor do not show the sensor's.
     """
     sensor, rate_hz = tree["sensor"], max(axis.recording.rate_hz for axis in readings.values())
-    averaged = stated and sensor["rate_hz"] > FASTER * rate_hz
-    if not stated or rate_hz > FASTER * sensor["rate_hz"]:
+    averaged = stated and sensor["rate_hz"] > FASTER_MOST * rate_hz
+    if not stated or rate_hz > FASTER_MOST * sensor["rate_hz"]:
         sensor |= {"rate_hz": float(f"{rate_hz:.6g}"), "filter_taps": 1}
     said = [f"{sensor['rate_hz']:g} Hz"]
     for group in model.groups:
@@ -191,10 +191,10 @@ def _inside(readings: Readings, limit: float) -> bool:
     """Whether a range of both signs keeps no reading of an axis out; where it clips, its level alone counts."""
     values = _known(readings)
     largest = np.abs(values).max() if readings.clipped is None else abs(np.median(values))
-    return bool(largest <= limit * (1.0 + ROUNDED))
+    return bool(largest <= limit * (1.0 + RANGE_ROUNDED))
 
 
-def _known(readings: Readings) -> NDArray[np.float64]:
+def _known(readings: Readings) -> Array:
     return readings.values[np.isfinite(readings.values)]
 
 
@@ -297,16 +297,16 @@ def _measured(recording: Recording, axis: str, model: Model) -> dict[str, Any]:
     result, law = in_unit(identified.result, identified.unit, group.unit), identified.result.best
     numbers = {"bias": float(np.nanmedian(recording.in_unit(axis, group.unit)))}
     numbers |= {key: estimate.median for key, estimate in result.parameters[law].items()}
-    numbers["N"] = without(numbers["N"], rounding({"lsb": group.lsb}, model.sensor_rate_hz))
+    numbers["N"] = density_without(numbers["N"], lattice_density({"lsb": group.lsb}, model.sensor_rate_hz))
     return {"hypothesis": law, **{key: float(f"{value:.6g}") for key, value in numbers.items()}}
 
 
-def rounding(group: Mapping[str, Any], rate_hz: float) -> float:
+def lattice_density(group: Mapping[str, Any], rate_hz: float) -> float:
     """White noise density that a sensor's read-out at this rate adds: lsb^2 / 12 to each reading."""
     return float(group.get("lsb") or 0.0) / math.sqrt(12.0 * rate_hz)
 
 
-def without(N: float, added: float) -> float:
+def density_without(N: float, added: float) -> float:
     """The density that makes N together with `added`."""
     return math.sqrt(max(N * N - added * added, 1e-4 * N * N))
 
@@ -339,7 +339,7 @@ def tree_of(
     return tree, said + finish(tree, name or default, recording)
 
 
-def as_text(tree: Mapping[str, Any], recording: Recording | None, said: Sequence[str]) -> str:
+def part_text(tree: Mapping[str, Any], recording: Recording | None, said: Sequence[str]) -> str:
     """The file: where its numbers are from, then the tree."""
     source = f" from {remark(recording.path.name)}, {recording.duration_s:.6g} s at rest" if recording else ""
     head = [f"# Written by `selfcal part`{source}.", *(f"# {remark(line)}" for line in said)]

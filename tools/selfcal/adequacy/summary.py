@@ -18,24 +18,21 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from selfcal.adequacy.allan import DRAWS, LONGEST, PER_OCTAVE, Terms, fit_of, posterior_draws
-from selfcal.adequacy.one_over_f import FLICKER, SURE, Beside, white_of
-from selfcal.bank.result import HALF_90, AxisResult, Estimate
+from selfcal.adequacy.allan import AVERAGES_LEAST, CURVE_DRAWS, PER_OCTAVE, AllanTerms, fit_of, posterior_draws
+from selfcal.adequacy.one_over_f import FLICKER, SURE_PROBABILITY, AddedLaw, white_beside
+from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
-from selfcal.base.grid import bisected, weighted_quantiles
+from selfcal.base.grid import Array, bisected, weighted_quantiles
 from selfcal.model.file import Group
-
-_Floats = NDArray[np.float64]
 
 #: The parameter of coloured noise.
 COLOURED = "spectral_ratio"
 #: Largest factor that is stated: of a rest to the record, of a unit's quantity to the batch's median.
 MOST_TIMES = 1000.0
 #: Least probability of a law that counts.
-_LEAST = 1e-3
+_LAW_LEAST = 1e-3
 #: Least ratio of an axis' N to its siblings' or its data sheet's that a line names.
 NOISIER = 2.0
 #: Least share of the posterior with a walk, or a minimum, that identifies the number.
@@ -50,7 +47,7 @@ ONE_OVER_F = "the drift is 1/f noise"
 
 
 @dataclass(frozen=True)
-class Number:
+class SheetNumber:
     """One of the numbers. `reason`: why it is not identified, else ""; its 95 % quantile is then an upper limit."""
 
     estimate: Estimate
@@ -63,25 +60,25 @@ def summarize(
     dt_s: float,
     n: int,
     block: int,
-    beside: Beside | None = None,
-    counted: Beside | None = None,
-) -> dict[str, Number]:
+    beside: AddedLaw | None = None,
+    counted: AddedLaw | None = None,
+) -> dict[str, SheetNumber]:
     """The numbers of an axis by their keys (arw, rrw, bias_instability, and quantization_noise where there is any), in
     the group's unit: of `n` readings every `dt_s`, gaps among them, each the mean of `block` samples. Empty where the
     record is too short for an Allan deviation. `beside`: 1/f noise, added to the laws of the result. `counted`:
     likewise white noise with quantization noise (counted.py)."""
-    if n < 2 * LONGEST:
+    if n < 2 * AVERAGES_LEAST:
         return {}
     more = 0.0 if beside is None else beside.probability
     left = 1.0 if counted is None else 1.0 - counted.probability
     laws = [
-        Beside(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
+        AddedLaw(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
         for law, probability in result.probability.items()
-        if probability >= _LEAST  # of the model's, whatever is added to them
+        if probability >= _LAW_LEAST  # of the model's, whatever is added to them
     ]
     of_model = len(laws)
     others = ((beside, more * left), (counted, 1.0 - left))
-    laws += [replace(law, probability=share) for law, share in others if law is not None and share >= _LEAST]
+    laws += [replace(law, probability=share) for law, share in others if law is not None and share >= _LAW_LEAST]
     sound = [
         (law, k < of_model)
         for k, law in enumerate(laws)
@@ -92,7 +89,7 @@ def summarize(
     white, walk, q, floor, side = (
         np.concatenate(rows) for rows in zip(*(_draws(law) for law, _ in sound), strict=True)
     )
-    w, own = np.repeat([[law.probability, float(mine)] for law, mine in sound], DRAWS, axis=0).T
+    w, own = np.repeat([[law.probability, float(mine)] for law, mine in sound], CURVE_DRAWS, axis=0).T
     w = w / w.sum()
     w_walk = w * own / max(float(w @ own), 1e-300) if (w * own).any() else w
     numbers = {
@@ -114,7 +111,7 @@ def summarize(
         return sum(share for share, sure in own if not sure) > 0.5 * sum(share for share, _ in own)
 
     rrw, why = numbers["rrw"].estimate, ""
-    if more >= SURE:
+    if more >= SURE_PROBABILITY:
         why = ONE_OVER_F
     elif float(w_walk[walk > 0.0].sum()) < _SURE:
         why = NO_WALK if max(result.probability.values()) >= _SURE else NOT_DECIDED
@@ -130,7 +127,7 @@ def summarize(
         most = [end for end in ends if math.isfinite(end)]
         if (w_walk * walk > 0.0).any():
             most.append(_number(walk, np.where(walk > 0.0, w_walk, 0.0) / w_walk[walk > 0.0].sum()).estimate.q95)
-        numbers["rrw"] = _without(Number(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
+        numbers["rrw"] = _without(SheetNumber(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
     if float(w[side == 0].sum()) < _SURE:
         reason = BELOW if float(w[side < 0].sum()) > float(w[side > 0].sum()) else NO_MINIMUM
         numbers["bias_instability"] = _without(numbers["bias_instability"], reason)
@@ -139,11 +136,11 @@ def summarize(
     return numbers
 
 
-def _identified(law: Beside) -> list[str]:
+def _identified(law: AddedLaw) -> list[str]:
     return [name for name, estimate in law.estimates.items() if estimate.identified]
 
 
-def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
+def _draws(beside: AddedLaw) -> tuple[Array, Array, Array, Array, Array]:
     """Draws of a law's posterior [k] each: white noise, walk (0: none), Q, the first minimum of the Allan deviation,
     and where it is."""
     law, group, dt_s, n, block = beside.law, beside.group, beside.dt_s, beside.n, beside.block
@@ -152,7 +149,7 @@ def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]
     fit = fit_of(law, medians, group, dt_s, n, m, block=block)
     draws = posterior_draws(beside.estimates, fit.covariance)
     if law == FLICKER:
-        white, floor = white_of(draws, dt_s, block), draws["B"] * units.FLICKER_FLOOR
+        white, floor = white_beside(draws, dt_s, block), draws["B"] * units.FLICKER_FLOOR
         side = (white**2 / (0.5 * n * dt_s) > floor**2).astype(float)  # below the white noise everywhere
     else:
         lowest = [_minimum(terms, m) for terms in fit.drawn(draws)]
@@ -194,7 +191,7 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
     estimates = result.parameters[law]
     open_ = [name for name, estimate in estimates.items() if not estimate.identified]
     medians = {name: estimate.median for name, estimate in estimates.items()}
-    if not open_ or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
+    if not open_ or n < 2 * AVERAGES_LEAST or not all(math.isfinite(value) for value in medians.values()):
         return {}
 
     def variance(times: float) -> dict[str, float]:
@@ -211,7 +208,7 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
     return {name: rest_s(name) for name in open_}
 
 
-def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:
+def _minimum(terms: AllanTerms, m: Array) -> tuple[float, int]:
     """The first minimum of the Allan deviation at `m` readings, and 0; where none lies inside, the lowest value
     with -1 (it rises from the first on) or 1 (it falls to the last)."""
     variance = terms.allan_variance(m)
@@ -220,15 +217,15 @@ def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:
     return math.sqrt(max(0.0, float(variance[lowest]))), 0 if inside.size else (-1 if lowest == 0 else 1)
 
 
-def _number(values: _Floats, weight: _Floats) -> Number:
+def _number(values: Array, weight: Array) -> SheetNumber:
     """Mean, sd and quantiles of weighted draws."""
     order = np.argsort(values, kind="stable")
     values, weight = values[order], weight[order]
     mean = float(weight @ values)
     sd = math.sqrt(max(0.0, float(weight @ (values - mean) ** 2)))
     low, middle, high = weighted_quantiles(values, weight, (0.05, 0.5, 0.95)).tolist()
-    return Number(Estimate(mean, middle, sd, low, high, identified=True))
+    return SheetNumber(Estimate(mean, middle, sd, low, high, identified=True))
 
 
-def _without(number: Number, reason: str) -> Number:
-    return Number(replace(number.estimate, identified=False), reason)
+def _without(number: SheetNumber, reason: str) -> SheetNumber:
+    return SheetNumber(replace(number.estimate, identified=False), reason)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
-from selfcal.base.grid import Array, equal_runs
+from selfcal.base.grid import Array, Mask, Rows, equal_runs
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import Group, Model
 from selfcal.model.tables import Tables, make_tables
@@ -20,7 +20,7 @@ from selfcal.readings.readings import mostly_beyond
 #: Intervals of an even grid, gaps included, that are computed one by one.
 MOST_DENSE = 10_000_000
 #: Fewest bank samples that are checked.
-FEWEST = 20
+BLOCKS_LEAST = 20
 
 
 @dataclass(frozen=True)
@@ -34,17 +34,17 @@ class Blocks:
     worked out.
     """
 
-    mean: NDArray[np.float64]
-    r: NDArray[np.float64]
+    mean: Array
+    r: Array
     kept_out: Mapping[str, int]
-    z: NDArray[np.float64]
+    z: Array
     after: int = 0
     begin: int = 0
 
 
 def usable_blocks(
     samples: NDArray[np.float32],
-    missing_before: NDArray[np.int64],
+    missing_before: Rows,
     tables: Tables,
     group: Group,
     columns: NDArray[np.float32] | None = None,
@@ -53,7 +53,7 @@ def usable_blocks(
     """block_means() of float32 samples [n] and columns [n, p]. Raises UserError if no report can come of them.
     `counted`: the samples kept out by reason, from those that the averaging knows."""
     z = None if columns is None else columns.astype(np.float64)
-    blocks = block_means(samples, missing_before, tables.block, group, z)
+    blocks = blocks_of(samples, missing_before, tables.block, group, z)
     blocks = replace(blocks, kept_out=counted(blocks.kept_out))
     present = blocks.mean[np.isfinite(blocks.mean)]
     needed = _library32.REPORT_MIN + len(tables.regressors)
@@ -68,7 +68,7 @@ def usable_blocks(
         more = alone if tables.block > 1 and each >= needed else ""
         raise UserError(f"too short: {averages}, {needed} are needed (samples kept out: {kept}){more}")
     # Other averages have lost most of their samples.
-    if present.size < FEWEST and whole < 0.25 * each:
+    if present.size < BLOCKS_LEAST and whole < 0.25 * each:
         raise UserError(f"too few whole averages: {averages} hold {whole:.0f} of the {each} readings{alone}")
     if not present.std() > 0.0:
         equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
@@ -84,7 +84,7 @@ def bank_means(recording: Recording, model: Model, name: str, rate_hz: float | N
     return usable_blocks(samples, recording.missing_before, tables, group).mean, tables.dt_s
 
 
-def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDArray[np.bool_]]:
+def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, Mask]:
     """Which of `samples` [n] are not used, by reason."""
     finite = np.isfinite(samples)
     limit = np.float32(group.range) if group.range > 0.0 else np.inf
@@ -98,12 +98,8 @@ def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDAr
     return {"not_finite": ~finite, "saturated": saturated, "stuck": stuck}
 
 
-def block_means(
-    samples: NDArray[np.floating[Any]],
-    missing_before: NDArray[np.int64],
-    block: int,
-    group: Group,
-    columns: NDArray[np.float64] | None = None,
+def blocks_of(
+    samples: NDArray[np.floating[Any]], missing_before: Rows, block: int, group: Group, columns: Array | None = None
 ) -> Blocks:
     """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out.
     `columns` [n, p] of the regressors are averaged over the same samples."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal import _library32
-from selfcal.bank.result import AxisResult, Estimate
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.base.errors import OutsidePriors, UserError
 from selfcal.model.laws import PLACES
 from selfcal.model.tables import Grid, Tables

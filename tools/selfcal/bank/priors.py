@@ -16,18 +16,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from selfcal.bank.result import FAINT, AxisResult
+from selfcal.bank.axis_result import LAW_LEAST, AxisResult
 from selfcal.base.errors import UserError
-from selfcal.base.grid import MEDIAN_SD
+from selfcal.base.grid import MEDIAN_SD, Array, Rows
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Group, Model, Prior
 from selfcal.model.laws import RATIOS
 from selfcal.model.tables import bank_block, make_tables
 from selfcal.readings.budget import CHECK_LIMIT, CLEARLY
-from selfcal.readings.lattice import ROUNDED
-from selfcal.readings.rest import FEWEST, rest_of
+from selfcal.readings.lattice import SAME_VALUE_SHARE
+from selfcal.readings.rest import PIECES_LEAST, rest_of
 
 #: Factor of the own prior of N to each side of the record's N.
 DECADES = 100.0
@@ -52,9 +51,9 @@ class Seen:
     interval, each from the median of `differences` [k] (all of them, where the median is of no noise)."""
 
     level: float
-    tau_s: NDArray[np.float64]
-    deviation: NDArray[np.float64]
-    differences: NDArray[np.int64]
+    tau_s: Array
+    deviation: Array
+    differences: Rows
 
     @property
     def N(self) -> float:
@@ -69,7 +68,7 @@ def for_record(model: Model, recording: Recording, axes: Sequence[str]) -> Model
     for name in axes:
         with suppress(UserError):  # of another kind, or without a sample: said where the axis is read
             group, seen = model.group_of(name), at_rest(recording, name, model)
-            if seen is None or known(group):
+            if seen is None or noise_is_known(group):
                 continue
             laid_out = about(group, seen) if outside(group, seen) else dict(group.priors)
             moved = moved_along(model, recording, name, laid_out, seen)
@@ -161,8 +160,8 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
             mean = total[whole] / size[whole]
             level = level if rows else float(np.median(mean))
             step = np.diff(mean)[np.diff(interval[whole]) == 1]
-            step[np.abs(step) < ROUNDED * np.abs(mean).max()] = 0.0
-            if step.size < (24 if rows else FEWEST):  # of a drift, more
+            step[np.abs(step) < SAME_VALUE_SHARE * np.abs(mean).max()] = 0.0
+            if step.size < (24 if rows else PIECES_LEAST):  # of a drift, more
                 break
             square = step * step
             typical, all_of_them = float(np.median(square)) / MEDIAN_SD**2, float(square.mean())
@@ -175,7 +174,7 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
     return Seen(level, *(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def known(group: Group) -> bool:
+def noise_is_known(group: Group) -> bool:
     """Whether the limits of N are knowledge of the part."""
     return group.priors["N"].max < NARROW * group.priors["N"].min
 
@@ -184,7 +183,7 @@ def outside(group: Group, seen: Seen) -> bool:
     """Whether a resting axis lies outside the priors of its group: its noise, its drift or its level. Never of a group
     whose N is known."""
     N = group.priors["N"]
-    if known(group):
+    if noise_is_known(group):
         return False
     # Two sd of ln N beyond a limit: 1.2 over sqrt(n) each.
     margin = math.exp(2.0 * 1.2 / math.sqrt(float(seen.differences[0])))
@@ -295,7 +294,7 @@ def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> boo
     gain = {law: second.log_evidence[law] - before for law, before in first.log_evidence.items()}
     whole = [float(np.logaddexp.reduce(list(result.log_evidence.values()))) for result in (first, second)]
     return whole[1] > whole[0] + CLEARLY or any(
-        gain[law] > CLEARLY and second.probability[law] > FAINT
+        gain[law] > CLEARLY and second.probability[law] > LAW_LEAST
         for law, estimates in second.parameters.items()
         if not estimates.keys().isdisjoint(moved) and not {"alpha"} & estimates.keys() & set(moved)
     )

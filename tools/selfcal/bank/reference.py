@@ -14,17 +14,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import generate_binary_structure, maximum_filter
 
 from selfcal import _reference
-from selfcal.bank.result import AxisResult, Estimate
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array, Rows
 from selfcal.model.file import Group, Prior
 from selfcal.model.laws import KINDS, Law
-
-_Floats = NDArray[np.float64]
-_Indices = NDArray[np.int64]
 
 #: Nats below the highest node at which the lattice ends: of a three-dimensional normal posterior 5e-7 lies beyond.
 _DEPTH = 16.0
@@ -33,7 +30,7 @@ _STEP = 0.75
 #: Fewest steps of a direction between its limits.
 _FEWEST = 24
 #: Most nodes of a hypothesis, and of a direction: a larger posterior is out of this engine's reach.
-_MOST = 2**20
+_NODES_MOST = 2**20
 #: Gregory's weights of the nodes nearest an end, from differences up to the fourth: error of order h^6.
 _GREGORY = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
 
@@ -43,26 +40,26 @@ class _Filtered:
     """m nodes: `value` [m] ln of likelihood times prior density in ln parameters; moments [m, 1 + p] of x0 + drift +
     c z now and of the coefficients c."""
 
-    value: _Floats
-    mean: _Floats
-    var: _Floats
+    value: Array
+    mean: Array
+    var: Array
 
 
 @dataclass(frozen=True)
 class _Posterior:
     ln_evidence: float
     parameters: dict[str, Estimate]
-    mean: _Floats
-    var: _Floats
+    mean: Array
+    var: Array
 
 
-def identify_axis(
-    y: _Floats,
+def reference_axis(
+    y: Array,
     dt: float,
     group: Group,
     hypotheses: Mapping[str, float],
-    r: _Floats | None = None,
-    z: _Floats | None = None,
+    r: Array | None = None,
+    z: Array | None = None,
     coefficient_sd: Sequence[float] = (),
     block: int = 1,
     ahead_s: float = 0.0,
@@ -73,7 +70,7 @@ def identify_axis(
     white noise variance of each (None: 1). `hypotheses`: prior probability by name. `z` float64[n, p] are the columns
     of the regressors in use, less their references, with the prior `coefficient_sd` of each. `y` are means of `block`
     samples. The bias is at `ahead_s` after the last of them. Raises UserError without a sample, and when a
-    posterior would take more than `_MOST` nodes.
+    posterior would take more than `_NODES_MOST` nodes.
     Source: Stepanov & Motorin (2017), equations (11) to (14).
     """
     n = int(np.isfinite(y).sum())
@@ -107,14 +104,14 @@ def identify_axis(
 
 
 def _posterior(
-    y: _Floats,
+    y: Array,
     dt: float,
     offset: float,
     group: Group,
     law: str,
-    r: _Floats | None,
-    z: _Floats | None,
-    sd: _Floats | None,
+    r: Array | None,
+    z: Array | None,
+    sd: Array | None,
     block: int,
     ahead_s: float,
 ) -> _Posterior:
@@ -129,7 +126,7 @@ def _posterior(
     low = np.log([prior.min for prior in priors])
     high = np.log([prior.max for prior in priors])
 
-    def filtered(x: _Floats) -> _Filtered:
+    def filtered(x: Array) -> _Filtered:
         """x [m, parameters]: ln of each parameter."""
         theta = {name: np.ascontiguousarray(column) for name, column in zip(names, np.exp(x).T, strict=True)}
         none = np.ones(len(x))
@@ -176,7 +173,7 @@ def _posterior(
     )
 
 
-def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Floats, _Floats]:
+def _later(of: Law, drift: Array, second: Array, time_s: float) -> tuple[Array, Array]:
     """Weight of each state now in the drift some time on [m, states], and the variance that it gains until then [m],
     at the drift and second parameters [m]."""
     terms = [KINDS[term.kind].later(term, time_s) for term in of.sized(drift, second)]
@@ -188,7 +185,7 @@ def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Fl
 # ------------------------------------------------------------------------------------------------- finding the modes
 
 
-def _modes(value: Callable[[_Floats], _Floats], low: _Floats, high: _Floats) -> _Floats:
+def _modes(value: Callable[[Array], Array], low: Array, high: Array) -> Array:
     """Maxima of `value` in the box, [modes, parameters], highest first.
 
     ln N, in which every posterior is narrow, is searched by zooming at each point of a coarse grid of the other
@@ -215,7 +212,7 @@ def _modes(value: Callable[[_Floats], _Floats], low: _Floats, high: _Floats) -> 
     starts = np.column_stack([best, rest])[peak]
     starts = starts[np.argsort(-profile[peak])][:4]
     step = (high - low) / (2.0 * np.array([500, *points]))
-    polished: list[tuple[float, _Floats]] = []
+    polished: list[tuple[float, Array]] = []
     for start in starts:
         simplex = np.clip(np.vstack([start, start + np.diag(step)]), low, high)
         simplex[1:] -= 2.0 * np.diag(step) * (np.diag(simplex[1:]) == start)  # at the upper limit: inwards
@@ -231,7 +228,7 @@ def _modes(value: Callable[[_Floats], _Floats], low: _Floats, high: _Floats) -> 
     return np.array([x for height, x in polished if height > polished[0][0] - _DEPTH])
 
 
-def _widths(value: Callable[[_Floats], _Floats], mode: _Floats, low: _Floats, high: _Floats) -> _Floats:
+def _widths(value: Callable[[Array], Array], mode: Array, low: Array, high: Array) -> Array:
     """Distance in each direction at which `value` has fallen by half a nat: one conditional sd of a normal
     posterior."""
     reach = 2.0 ** np.arange(-40, 1)
@@ -260,21 +257,21 @@ class _Lattice:
     """
 
     def __init__(
-        self, filtered: Callable[[_Floats], _Filtered], low: _Floats, high: _Floats, widths: _Floats, moments: int
+        self, filtered: Callable[[Array], _Filtered], low: Array, high: Array, widths: Array, moments: int
     ) -> None:
         self.filtered, self.low, self.high = filtered, low, high
         steps = np.maximum(np.ceil((high - low) / (_STEP * widths)), _FEWEST)
-        self.count: _Indices = (2 * np.ceil(np.minimum(steps, _MOST) / 2)).astype(np.int64)
-        self.index: _Indices = np.empty((0, len(low)), np.int64)
+        self.count: Rows = (2 * np.ceil(np.minimum(steps, _NODES_MOST) / 2)).astype(np.int64)
+        self.index: Rows = np.empty((0, len(low)), np.int64)
         self.value = np.empty(0)
         self.mean, self.var = np.empty((0, moments)), np.empty((0, moments))
         self.top = -math.inf
 
-    def x(self, index: _Indices) -> _Floats:
+    def x(self, index: Rows) -> Array:
         """ln parameters [m, D] of nodes."""
         return self.low + (self.high - self.low) * (index / self.count)
 
-    def start(self, seeds: _Floats) -> None:
+    def start(self, seeds: Array) -> None:
         """Filter the nodes nearest to `seeds` [modes, D] and all that connects to them."""
         self._add(np.unique(np.rint((seeds - self.low) / (self.high - self.low) * self.count).astype(np.int64), axis=0))
         self._spread()
@@ -308,20 +305,20 @@ class _Lattice:
                 # ln evidence may change by 4e-4, which moves a probability by 1e-4, and a moment by 5e-3 posterior sd.
                 excess.append(max(abs(half[0] - full[0]) / 4e-4, float(moments.max()) / 5e-3))
             worst = int(np.argmax(excess))
-            if excess[worst] <= 1.0 or self.count[worst] >= _MOST:
+            if excess[worst] <= 1.0 or self.count[worst] >= _NODES_MOST:
                 return
             self.index[:, worst] *= 2
             self.count[worst] *= 2
             self._spread()
 
-    def mass(self, halved: int | None) -> _Floats:
+    def mass(self, halved: int | None) -> Array:
         """Share of each node [m] in the integral over e^top; `halved`: a direction in which odd nodes are left out."""
         weight = np.exp(self.value - self.top)
         for d in range(len(self.low)):
             weight = weight * self._weight(d, 2 if d == halved else 1)
         return weight
 
-    def marginal(self, d: int) -> tuple[_Floats, _Floats]:
+    def marginal(self, d: int) -> tuple[Array, Array]:
         """Nodes of direction d and the posterior density (not normalised) at each."""
         weight = np.exp(self.value - self.top)
         for other in range(len(self.low)):
@@ -332,7 +329,7 @@ class _Lattice:
         share = np.arange(start, stop + 1) / float(self.count[d])
         return np.asarray(self.low[d] + (self.high[d] - self.low[d]) * share, np.float64), np.asarray(rows, np.float64)
 
-    def _weight(self, d: int, stride: int) -> _Floats:
+    def _weight(self, d: int, stride: int) -> Array:
         index, rest = self.index[:, d] // stride, self.index[:, d] % stride
         count = self.count[d] // stride
         from_end = np.minimum(np.minimum(index, count - index), len(_GREGORY))
@@ -340,7 +337,7 @@ class _Lattice:
         weight = np.append(_GREGORY, 1.0)[from_end] * step
         return np.asarray(np.where(rest == 0, weight, 0.0), np.float64)
 
-    def _summary(self, halved: int | None) -> _Floats:
+    def _summary(self, halved: int | None) -> Array:
         """ln integral over e^top, then means [D], then standard deviations [D] of the ln parameters."""
         mass = self.mass(halved)
         total = float(mass.sum())
@@ -350,10 +347,10 @@ class _Lattice:
         mean = mass @ x / total
         return np.concatenate([[math.log(total)], mean, np.sqrt(mass @ (x - mean) ** 2 / total)])
 
-    def _add(self, index: _Indices) -> None:
-        if len(self.index) + len(index) > _MOST:
+    def _add(self, index: Rows) -> None:
+        if len(self.index) + len(index) > _NODES_MOST:
             raise UserError(
-                f"the reference engine needs more than {_MOST} nodes for this record; take --engine library"
+                f"the reference engine needs more than {_NODES_MOST} nodes for this record; take --engine library"
             )
         new = self.filtered(self.x(index))
         self.index = np.concatenate([self.index, index])
@@ -362,11 +359,11 @@ class _Lattice:
         self.var = np.concatenate([self.var, new.var])
         self.top = float(self.value.max())
 
-    def _key(self, index: _Indices) -> _Indices:
+    def _key(self, index: Rows) -> Rows:
         shifts = 21 * np.arange(index.shape[1])
         return np.asarray((index << shifts).sum(axis=1), np.int64)
 
-    def _index(self, key: _Indices) -> _Indices:
+    def _index(self, key: Rows) -> Rows:
         shifts = 21 * np.arange(len(self.low))
         return np.asarray((key[:, None] >> shifts) & (2**21 - 1), np.int64)
 

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal import _library32
-from selfcal.bank.result import HALF_90, AxisResult, of_mixture
+from selfcal.bank.axis_result import HALF_90, AxisResult, of_mixture
+from selfcal.base.grid import Array
 from selfcal.model.regressors import Choice, coefficient_unit, ln_prior
 
 #: Least probability of a law that may be true. The widest of these laws of a subset states the coefficient. If a record
@@ -42,7 +42,7 @@ class Inclusion:
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredSubsets:
     """All subsets of the regressors weighed together.
 
     `result`: probabilities, evidence and bias over all subsets; parameters of each law are those of its most probable
@@ -58,7 +58,7 @@ class Scored:
 
 def combine(
     choices: Sequence[Choice], results: Sequence[AxisResult], hypotheses: Mapping[str, float], unit: str
-) -> Scored:
+) -> ScoredSubsets:
     """Weigh the subsets by their evidence; `unit` is that of the axis. At least one must have evidence."""
     from scipy.special import logsumexp
 
@@ -95,7 +95,7 @@ def combine(
                     parts.append((of_choice[i], *widest))
             coefficients.append(_coefficient(column, coefficient_unit(unit, regressor.unit), np.array(parts)))
         inclusion[regressor.name] = Inclusion(float(of_choice[having].sum()), tuple(coefficients))
-    return Scored(combined, inclusion, tuple(choices), tuple(of_choice.tolist()), int(np.argmax(of_choice)))
+    return ScoredSubsets(combined, inclusion, tuple(choices), tuple(of_choice.tolist()), int(np.argmax(of_choice)))
 
 
 def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coefficient:
@@ -103,7 +103,7 @@ def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coeffi
     return Coefficient(column, unit, mean, sd, mean - HALF_90 * sd, mean, mean + HALF_90 * sd)
 
 
-def _coefficient(column: str, unit: str, parts: NDArray[np.float64]) -> Coefficient:
+def _coefficient(column: str, unit: str, parts: Array) -> Coefficient:
     """A mixture of normals, `parts` [m, 3]: weight, mean, sd of each. Not a number without any weight."""
     mixture = of_mixture(*parts.T) if parts.size else (math.nan,) * 5
     return Coefficient(column, unit, *mixture)

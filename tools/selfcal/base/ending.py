@@ -30,7 +30,7 @@ class Stopped(Exception):
 _AGAIN_S = 0.02
 
 
-class Held:
+class HeldSignals:
     """The signal that came while signals are held: whether it has asked for the end. One for the process."""
 
     holding = False
@@ -42,23 +42,23 @@ class Held:
     @property
     def asked(self) -> bool:
         """A signal came."""
-        return Held.came is not None
+        return HeldSignals.came is not None
 
     @property
     def overdue(self) -> bool:
         """A signal came 0.6 s ago: results have to be written."""
-        return Held.came is not None and time.monotonic() > Held.came_at + 0.6
+        return HeldSignals.came is not None and time.monotonic() > HeldSignals.came_at + 0.6
 
     def check(self) -> None:
         """Raise Ended if a signal came."""
-        if Held.came is not None:
-            number, Held.came = Held.came, None
+        if HeldSignals.came is not None:
+            number, HeldSignals.came = HeldSignals.came, None
             _end(number)
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
-    if Held.holding and Held.came is None:
-        Held.came, Held.came_at = number, time.monotonic()  # a second one ends at once, whatever is held
+    if HeldSignals.holding and HeldSignals.came is None:
+        HeldSignals.came, HeldSignals.came_at = number, time.monotonic()  # a second one ends at once, whatever is held
         return
     if _imports(frame):
         signal.signal(signal.SIGALRM, lambda _, later: _on_signal(number, later))
@@ -77,30 +77,30 @@ def _imports(frame: FrameType | None) -> bool:
 
 
 def _end(number: int) -> NoReturn:
-    Held.raised = number
+    HeldSignals.raised = number
     raise Ended(number)
 
 
 def last_signal() -> int:
     """Exit code for the signal that was raised, 128 + its number; 0: none was."""
-    return 0 if Held.raised is None else 128 + Held.raised
+    return 0 if HeldSignals.raised is None else 128 + HeldSignals.raised
 
 
 def abandon() -> None:
     """Threads are left at their work: the process ends without them."""
-    Held.abandoned = True
+    HeldSignals.abandoned = True
 
 
 def leave(code: int) -> NoReturn:
     """End the process, whatever threads are still at work."""
-    if Held.abandoned:
+    if HeldSignals.abandoned:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         os._exit(code)
     sys.exit(code)
 
 
-def install() -> None:
+def install_signals() -> None:
     """Have the signals raise Ended. One that is ignored stays so: `nohup`, a shell's background job."""
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
@@ -108,15 +108,15 @@ def install() -> None:
 
 
 @contextmanager
-def held() -> Iterator[Held]:
-    """Within, a signal is noted instead of raised, if `install()` has been called; the caller asks `asked`.
+def hold_signals() -> Iterator[HeldSignals]:
+    """Within, a signal is noted instead of raised, if `install_signals()` has been called; the caller asks `asked`.
 
     What came stays noted after the end of the block until `check()` raises it.
     """
-    before, Held.holding = Held.holding, True
+    before, HeldSignals.holding = HeldSignals.holding, True
     if not before:
-        Held.came = None
+        HeldSignals.came = None
     try:
-        yield Held()
+        yield HeldSignals()
     finally:
-        Held.holding = before
+        HeldSignals.holding = before

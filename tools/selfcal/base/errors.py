@@ -68,7 +68,7 @@ def few(names: Sequence[str], most: int = 5, more: str = "more") -> str:
     return ", ".join(names[:most]) + (f" and {rest} {more}" if rest > 0 else "")
 
 
-def shown(value: object) -> str:
+def short_value(value: object) -> str:
     """A short form of any value that a file holds: never long, never an exception."""
     try:
         return printable(_SHOWN.repr(value))
@@ -76,7 +76,7 @@ def shown(value: object) -> str:
         return f"a {type(value).__name__}"
 
 
-def install(what: str) -> str:
+def install_line(what: str) -> str:
     """The line to type for a package that is not installed with this one: its name, or `selfcal[extra]`."""
     return f"{shlex.quote(sys.executable)} -m pip install {shlex.quote(what)}"
 

@@ -45,7 +45,7 @@ LEAST_RATE_HZ, MOST_RATE_HZ = 1e-6, 1e6
 MOST_CLOCKS = 8
 #: Longest span of a recording: seconds, and samples, missing ones included. A law takes 20 000 intervals, each of at
 #: most 10^6 s and 2^32 samples (lib/bank.c).
-LONGEST_S, LONGEST = 1e10, 2**46
+LONGEST_S, LONGEST_SAMPLES = 1e10, 2**46
 
 
 @contextmanager

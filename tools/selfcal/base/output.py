@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import math
 import os
@@ -208,34 +207,3 @@ def table_of(headings: Iterable[str], title: str | None = None, *, wraps: bool =
     for heading in headings:
         table.add_column(heading, no_wrap=not wraps, overflow="fold" if wraps else "ellipsis")
     return table
-
-
-def plotter() -> Any:
-    """matplotlib's pyplot, without a screen. Its settings are the user's own: those of the folder that the user is in,
-    where files of strangers may lie, would be taken first."""
-    with contextlib.chdir("/"):
-        import matplotlib
-    if "matplotlib.pyplot" not in sys.modules and not os.environ.get("MPLBACKEND", "").startswith("module:"):
-        matplotlib.use("Agg")  # a notebook has its own
-    from matplotlib import pyplot
-
-    return pyplot
-
-
-def png_of(figure: Any, dpi: int) -> bytes:
-    """A figure as PNG; it is closed."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=dpi)
-    plotter().close(figure)
-    return stream.getvalue()
-
-
-def save_picture(figure: Any, path: Path | str, dpi: int) -> None:
-    """Write a figure whole or not at all, and close it. Raises UserError where it cannot be saved."""
-    try:
-        with whole(path) as temporary:
-            figure.savefig(temporary, dpi=dpi)
-    except ValueError as error:
-        raise UserError(f"{path}: cannot save the plot: {error}") from error
-    finally:
-        plotter().close(figure)

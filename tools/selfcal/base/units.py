@@ -15,10 +15,8 @@ from fractions import Fraction
 from functools import cache, partial
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from selfcal.base.errors import UserError, short
+from selfcal.base.grid import Array
 
 #: m/s^2 per g (3rd CGPM, 1901: exact by definition).
 STANDARD_GRAVITY = 9.80665
@@ -29,7 +27,7 @@ FLICKER_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
 #: Counts of the sensor's least significant bit; a scale turns them into a unit.
 LSB = "LSB"
 
-_Value = TypeVar("_Value", float, NDArray[np.float64])
+_Value = TypeVar("_Value", float, Array)
 # Dimensions: exponents of (angle, length, time, temperature, voltage, current, magnetic flux density, pressure).
 _Dimension = tuple[Fraction, ...]
 
@@ -99,7 +97,7 @@ class Unit:
 
 _FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d(?:\.\d{1,2})?))?)\Z", re.ASCII)
 #: Longest name of a unit, and its sizes in SI: all that means something, and no power of it overflows.
-_LONGEST, _LEAST, _MOST = 60, 1e-30, 1e30
+_NAME_MOST, _SIZE_LEAST, _SIZE_MOST = 60, 1e-30, 1e30
 #: Signs of data sheets, and their spelling here.
 _SIGNS = str.maketrans(
     {"°": "deg", "º": "deg", "℃": "degC", "℉": "degF", "²": "^2", "³": "^3", "µ": "u", "μ": "u", "⁻": "-", "¹": "1",
@@ -150,7 +148,7 @@ def plain(name: str) -> str:
     """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²`, `m s^-2`, `m/s2` -> `m/s^2`;
     `√Hz` -> `sqrt(Hz)`; other texts stay."""
     spelled = _ROOT.sub(r"sqrt(\1)", name.strip().replace("°s", "deg s").translate(_SIGNS))
-    if spelled == LSB or len(spelled) > _LONGEST or known(spelled):
+    if spelled == LSB or len(spelled) > _NAME_MOST or known(spelled):
         return spelled
     usual = _SPELLED.sub(lambda prefix: "u" if prefix[1].lower() == "micro" else prefix[1][0].lower(), spelled)
     usual = _SQUARED.sub("^2", _PER.sub("/", usual))
@@ -189,7 +187,7 @@ def parse(name: str) -> Unit:
     """The unit called `name`. Raises UserError for an unknown unit."""
     dimension, size = _NONE, 1.0
     unknown = UserError(f"unknown unit '{short(name)}' (known: {', '.join(RECORDING_UNITS)})")
-    if len(name) > _LONGEST:
+    if len(name) > _NAME_MOST:
         raise unknown
     for sign, part in re.findall(r"(\A|[*/])([^*/]*)", name):
         match = _FACTOR.match(part)
@@ -202,7 +200,7 @@ def parse(name: str) -> Unit:
         kind, scale = atom
         dimension = tuple(have + power * more for have, more in zip(dimension, kind, strict=True))
         size *= scale ** float(power)
-        if not _LEAST < size < _MOST:
+        if not _SIZE_LEAST < size < _SIZE_MOST:
             raise unknown
     return Unit(name, dimension, size, _ZERO.get(name, 0.0))
 
@@ -228,7 +226,7 @@ def factor(unit: str, to: str) -> float:
     return source.size / target.size
 
 
-def convert(value: _Value, unit: str, to: str) -> _Value:
+def converted(value: _Value, unit: str, to: str) -> _Value:
     """`value` (any shape) of `unit` in `to`, unchanged if alike; temperatures as points on their scales. Raises
     UserError as `factor`."""
     scale = factor(unit, to)

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from selfcal.adequacy.summary import MOST_TIMES
-from selfcal.bank.result import HALF_90, bias_of, likeliest, sd_of
+from selfcal.bank.axis_result import HALF_90, bias_of, likeliest, sd_of
 from selfcal.base import units as unit_module
 from selfcal.base.errors import MOST_NAMED, UserError, few
-from selfcal.batch.drift import Drift, Series, drifts_of
+from selfcal.batch.drift import Drift, DriftSeries, drifts_of
 from selfcal.batch.population import (
-    FEWEST,
-    FEWEST_OF_GROUP,
+    GROUP_UNITS_LEAST,
     MOST_ODD,
     TWO_GROUPS,
+    UNITS_LEAST,
     Apart,
     Grouping,
     Interval,
@@ -27,7 +27,7 @@ from selfcal.batch.population import (
     populations,
     sd_off,
 )
-from selfcal.batch.unit_table import Unit
+from selfcal.batch.unit_table import BatchUnit
 from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
@@ -57,7 +57,7 @@ class Batch:
 
     `unidentified`: quantities without a population, as too few units identify them: how many do, of how many."""
 
-    devices: Mapping[str, Sequence[Unit]]
+    devices: Mapping[str, Sequence[BatchUnit]]
     populations: Sequence[Population]
     unlike: Mapping[str, Sequence[str]]
     drifts: Sequence[Drift]
@@ -66,11 +66,11 @@ class Batch:
     unidentified: Mapping[str, tuple[int, int]]
 
 
-def summed_up(units: Sequence[Unit], model: Model) -> Batch:
+def summed_up(units: Sequence[BatchUnit], model: Model) -> Batch:
     """The batch of recordings `units`. Its axes are in the units of the model's groups.
 
     `left_out`: the devices whose axis reads in a unit of another kind, by axis and reason."""
-    devices: dict[str, list[Unit]] = {}
+    devices: dict[str, list[BatchUnit]] = {}
     left_out: dict[tuple[str, str], dict[str, None]] = {}
     for unit in units:
         if unit.error is None:
@@ -78,7 +78,7 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
                 name: _converted(axis, model.group_of(name).unit, offered(model, name))
                 for name, axis in unit.axes.items()
             }
-            own = Unit(unit.source, {**unit.record, "axes": axes})
+            own = BatchUnit(unit.source, {**unit.record, "axes": axes})
             devices.setdefault(unit.device, []).append(own)
             for axis, reason in own.errors.items():
                 if axis not in unit.errors:
@@ -114,7 +114,7 @@ def _converted(axis: Mapping[str, Any], to: str, regressors: Sequence[Regressor]
         factor = unit_module.factor(bias["unit"], to)
     except UserError:
         return {**axis, "error": f"reads in {bias['unit']}, the model in {to}"}
-    mean = unit_module.convert(bias["mean"], bias["unit"], to)
+    mean = unit_module.converted(bias["mean"], bias["unit"], to)
     parameters = {
         law: {name: _estimate_in(estimate, name, to) for name, estimate in of.items()}
         for law, of in axis["parameters"].items()
@@ -141,12 +141,12 @@ def _scaled(estimate: Mapping[str, Any], factor: float, unit: str) -> Mapping[st
     return {**estimate, **{key: factor * value for key, value in numbers.items()}, "unit": unit}
 
 
-def group_of(kind: str, unit: Unit) -> str:
+def group_of(kind: str, unit: BatchUnit) -> str:
     """The name of the unit's station, day or lot; "" for none."""
     return unit.recorded_at[:10] if kind == "day" else str(getattr(unit.source, kind))
 
 
-def sound_of(devices: Mapping[str, Sequence[Unit]], axis: str) -> dict[str, list[Mapping[str, Any]]]:
+def sound_of(devices: Mapping[str, Sequence[BatchUnit]], axis: str) -> dict[str, list[Mapping[str, Any]]]:
     """The results of an axis, by device."""
     results = {
         name: [unit.axes[axis] for unit in units if axis in unit.axes and "error" not in unit.axes[axis]]
@@ -155,7 +155,7 @@ def sound_of(devices: Mapping[str, Sequence[Unit]], axis: str) -> dict[str, list
     return {name: axes for name, axes in results.items() if axes}
 
 
-def axes_of(devices: Mapping[str, Sequence[Unit]]) -> list[str]:
+def axes_of(devices: Mapping[str, Sequence[BatchUnit]]) -> list[str]:
     """All axes of the devices."""
     return list(dict.fromkeys(axis for units in devices.values() for unit in units for axis in unit.axes))
 
@@ -167,7 +167,7 @@ def _behind(axis: Mapping[str, Any]) -> dict[str, float]:
     return {law: best - value if math.isfinite(value) else math.inf for law, value in evidence.items()}
 
 
-def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
+def _laws(devices: Mapping[str, Sequence[BatchUnit]]) -> dict[str, str]:
     """The law that the batch has, by axis: the law of most units, by the greatest likelihood of their shares.
 
     An odd unit weighs no more than another, however many nats it has. Expectation and maximization find the shares."""
@@ -184,7 +184,7 @@ def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownAlone:
     """A quantity, or its logarithm, by one recording alone: `y` with the error `s`."""
 
     y: float
@@ -195,10 +195,10 @@ class Known:
 
 
 #: The recordings of a batch: by axis, device and recording, with its date in days, what it says of each quantity.
-OfAxis = dict[str, list[tuple[float | None, dict[str, Known]]]]
+OfAxis = dict[str, list[tuple[float | None, dict[str, KnownAlone]]]]
 
 
-def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model: Model) -> dict[str, OfAxis]:
+def _known(devices: Mapping[str, Sequence[BatchUnit]], laws: Mapping[str, str], model: Model) -> dict[str, OfAxis]:
     known_of: dict[str, OfAxis] = {}
     for axis, law in laws.items():
         group, regressors = model.group_of(axis), offered(model, axis)
@@ -211,7 +211,9 @@ def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model
     return known_of
 
 
-def _of_recording(axis: Mapping[str, Any], law: str, group: Group, regressors: Sequence[Regressor]) -> dict[str, Known]:
+def _of_recording(
+    axis: Mapping[str, Any], law: str, group: Group, regressors: Sequence[Regressor]
+) -> dict[str, KnownAlone]:
     """Parameters of a law, coefficients of regressors, and the bias, by a recording.
 
     A unit whose own law has N where the batch's has no number is compared by its own."""
@@ -225,11 +227,11 @@ def _of_recording(axis: Mapping[str, Any], law: str, group: Group, regressors: S
         ):
             quantities[column] = _coefficient(estimate, regressor.sd[group.name])
     bias = bias_of(axis)
-    quantities["bias"] = Known(bias["median"], sd_of(bias), identified=True, unit=group.unit, logarithm=False)
+    quantities["bias"] = KnownAlone(bias["median"], sd_of(bias), identified=True, unit=group.unit, logarithm=False)
     return {name: known for name, known in quantities.items() if known is not None}
 
 
-def _parameter(estimate: Mapping[str, Any], prior: Prior | None) -> Known | None:
+def _parameter(estimate: Mapping[str, Any], prior: Prior | None) -> KnownAlone | None:
     """ln of a parameter. A uniform `prior` leans upwards by s^2 in the logarithm. None: the recording says nothing.
 
     An estimate off the grid counts: it is rough, and far from the batch's if it is odd."""
@@ -240,21 +242,21 @@ def _parameter(estimate: Mapping[str, Any], prior: Prior | None) -> Known | None
     y = math.log(median)
     if prior is not None and prior.law == "uniform":
         y -= s**2
-    known = Known(y, s, estimate["identified"], estimate["unit"], logarithm=True)
+    known = KnownAlone(y, s, estimate["identified"], estimate["unit"], logarithm=True)
     return (
         _without(known, math.log(prior.median), prior.sd) if prior is not None and prior.law == "log_normal" else known
     )
 
 
-def _coefficient(estimate: Mapping[str, Any], sd: float) -> Known | None:
+def _coefficient(estimate: Mapping[str, Any], sd: float) -> KnownAlone | None:
     """A coefficient, whose prior is about 0. It is identified where the recording halves that prior's sd."""
     mean, s = estimate["mean"], estimate["sd"]
     if mean is None or s is None or not 0.0 < s < math.inf:
         return None
-    return _without(Known(mean, s, s <= 0.5 * sd, estimate["unit"], logarithm=False), 0.0, sd)
+    return _without(KnownAlone(mean, s, s <= 0.5 * sd, estimate["unit"], logarithm=False), 0.0, sd)
 
 
-def _without(known: Known, mean: float, sd: float) -> Known | None:
+def _without(known: KnownAlone, mean: float, sd: float) -> KnownAlone | None:
     """A quantity without its normal prior. None: hardly anything is left."""
     own = known.s**-2 - sd**-2
     if own < 0.1 * sd**-2:
@@ -280,8 +282,8 @@ def _measured(
             }
             own = {device: of if name != "bias" else of[-1:] for device, of in own.items() if of}
             identified = sum(any(record.identified for record in of) for of in own.values())
-            if identified < max(FEWEST, 0.5 * len(of_axis)):
-                unidentified |= {f"{axis}.{name}": (identified, len(of_axis))} if len(of_axis) >= FEWEST else {}
+            if identified < max(UNITS_LEAST, 0.5 * len(of_axis)):
+                unidentified |= {f"{axis}.{name}": (identified, len(of_axis))} if len(of_axis) >= UNITS_LEAST else {}
                 continue
             y, s = np.array([_joined(of) for of in own.values()], np.float64).T
             devices = np.array([index[device] for device in own], np.intp)
@@ -289,12 +291,12 @@ def _measured(
             yield Measured(f"{axis}.{name}", first.unit, laws[axis], y, s, devices, first.logarithm)
 
 
-def _joined(known: Sequence[Known]) -> tuple[float, float]:
+def _joined(known: Sequence[KnownAlone]) -> tuple[float, float]:
     weight = np.array([record.s**-2 for record in known])
     return float(weight @ np.array([record.y for record in known]) / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def _series(known: Mapping[str, OfAxis], names: Sequence[str]) -> Iterator[Series]:
+def _series(known: Mapping[str, OfAxis], names: Sequence[str]) -> Iterator[DriftSeries]:
     """Each quantity of each device that has recordings of two dates or more."""
     for axis, of_axis in known.items():
         for index, device in enumerate(names):
@@ -304,7 +306,7 @@ def _series(known: Mapping[str, OfAxis], names: Sequence[str]) -> Iterator[Serie
                 days = np.array([day for day, _ in own])
                 if np.unique(days).size > 1:
                     y, s = np.array([(quantity.y, quantity.s) for _, quantity in own], np.float64).T
-                    yield Series(index, f"{axis}.{name}", own[0][1].unit, own[0][1].logarithm, days, y, s)
+                    yield DriftSeries(index, f"{axis}.{name}", own[0][1].unit, own[0][1].logarithm, days, y, s)
 
 
 def _off(population: Population, off: float, log_p: float) -> str:
@@ -316,7 +318,7 @@ def _off(population: Population, off: float, log_p: float) -> str:
 
 
 def _marked(
-    devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], shared: Sequence[Shared]
+    devices: Mapping[str, Sequence[BatchUnit]], laws: Mapping[str, str], shared: Sequence[Shared]
 ) -> Iterator[tuple[str, str, str]]:
     """Axes of devices with what few others have, and its words: another lattice or law than most, a mark, a cause.
 
@@ -324,7 +326,7 @@ def _marked(
     known = {(cause.kind, cause.name, cause.cause) for cause in shared}
     for axis in axes_of(devices):
         sound = sound_of(devices, axis)
-        if len(sound) < FEWEST:
+        if len(sound) < UNITS_LEAST:
             continue
         lattice = [axes[-1]["lattice"] for axes in sound.values() if "lattice" in axes[-1]]
         step = float(np.median(lattice)) if len(lattice) >= 0.5 * len(sound) else math.nan
@@ -350,7 +352,7 @@ def _marked(
                 yield from ((axis, name, words) for name, words in words_of.items())
 
 
-def _shared(devices: Mapping[str, Sequence[Unit]], groupings: Sequence[Grouping]) -> list[Shared]:
+def _shared(devices: Mapping[str, Sequence[BatchUnit]], groupings: Sequence[Grouping]) -> list[Shared]:
     """Causes that a group's units have more often than chance gives it: Fisher's exact test, one-sided.
 
     FALSE_ALARM is shared among all groups and causes."""
@@ -363,7 +365,7 @@ def _shared(devices: Mapping[str, Sequence[Unit]], groupings: Sequence[Grouping]
         for kind, names in groupings
         for group in dict.fromkeys(names)
         for cause in named
-        if group and FEWEST_OF_GROUP <= names.count(group) < len(names)
+        if group and GROUP_UNITS_LEAST <= names.count(group) < len(names)
     ]
     shared = []
     for kind, group, names, cause in tests:
@@ -379,7 +381,7 @@ def _shared(devices: Mapping[str, Sequence[Unit]], groupings: Sequence[Grouping]
 # ---------------------------------------------------------------------------------------------------------- in words
 
 
-def document_of(batch: Batch) -> dict[str, Any]:
+def batch_keys(batch: Batch) -> dict[str, Any]:
     """The keys of `selfcal.fleet/1` that a batch has: `population`, `unlike`, `shared_causes` and `units`."""
     names = list(batch.devices)
     units: dict[str, dict[str, Any]] = {}
@@ -387,7 +389,9 @@ def document_of(batch: Batch) -> dict[str, Any]:
         measured = population.measured
         for k, device in enumerate(measured.at.tolist()):
             own = population.shrunken(k)
-            units.setdefault(names[device], {})[measured.name] = vars(plain(measured, own)) | {"unit": measured.unit}
+            units.setdefault(names[device], {})[measured.name] = vars(plain_interval(measured, own)) | {
+                "unit": measured.unit
+            }
     drift: dict[str, dict[str, Any]] = {}
     drifting: dict[str, list[str]] = {}
     for slope in batch.drifts:
@@ -408,7 +412,7 @@ def document_of(batch: Batch) -> dict[str, Any]:
     }
 
 
-def plain(measured: Measured, of: Interval) -> Interval:
+def plain_interval(measured: Measured, of: Interval) -> Interval:
     """An interval of the quantity itself where the fit is of its logarithm."""
     return of.through(math.exp) if measured.logarithm else of
 
@@ -427,7 +431,7 @@ def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
         "unit": measured.unit,
         "units": int(measured.y.size),
         "of": "ln" if measured.logarithm else "value",
-        "middle": vars(plain(measured, population.fit.middle)),
+        "middle": vars(plain_interval(measured, population.fit.middle)),
         "spread": vars(population.fit.spread),
         "unlike_from": _seen_from(population),
         "left_out": [names[device] for device in measured.at[~population.kept].tolist()],
@@ -441,7 +445,7 @@ def lines_of(batch: Batch) -> Iterator[str]:
     """A line for each population, quantity without population, axis left out, group apart, and shared cause."""
     for population in batch.populations:
         measured = population.measured
-        middle, spread = plain(measured, population.fit.middle), population.fit.spread
+        middle, spread = plain_interval(measured, population.fit.middle), population.fit.spread
         kind = "spread of ln" if measured.logarithm else "spread"
         yield (
             f"population: {measured.name} ({measured.y.size} units): {middle.median:.4g} [{middle.q05:.4g}, "

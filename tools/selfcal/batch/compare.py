@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from selfcal.bank.result import bias_of, likeliest, sd_of
+from selfcal.bank.axis_result import bias_of, likeliest, sd_of
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.population import sd_off
@@ -52,7 +52,7 @@ def incomparable(verdicts: Mapping[str, Mapping[str, Any] | None]) -> str | None
     return f"the recordings have it in {' and '.join(used)}" if len(used) > 1 else None
 
 
-def verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Any]:
+def verdict_of(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Any]:
     """Verdict and causes of an axis of a recording, or why one of the two has no result."""
     error = diagnosed.get("error", identified.get("error"))
     if error is not None:
@@ -95,9 +95,7 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
         cause = str(finding["cause"])
         counted[cause] = counted.get(cause, 0) + 1
         label = cause if counted[cause] == 1 else f"{cause} {counted[cause]}"
-        own_sizes = {
-            key: size for key in SIZES if isinstance(size := finding["estimate"].get(key), Mapping)
-        }
+        own_sizes = {key: size for key in SIZES if isinstance(size := finding["estimate"].get(key), Mapping)}
         first: Mapping[str, Any] = next(iter(own_sizes.values()), {})
         size = {part: first[part] for part in ("median", "unit") if part in first}
         sizes[label] = {"present": True, "small": cause not in matter, **size}
@@ -155,9 +153,9 @@ def compared_of(
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """Print for each pair of recordings a line a change, the largest first, then the findings of each recording that
     matter, as `diagnose` words them."""
-    from selfcal.show.comparison_page import names_of, told_of
+    from selfcal.show.comparison_page import short_names, told_of
 
-    console, names = console_of(to_stderr=to_stderr), names_of(document)
+    console, names = console_of(to_stderr=to_stderr), short_names(document)
     say = partial(print_line, console)
     errors = {name: axis["error"] for name, axis in document["axes"].items() if isinstance(axis, Mapping)}
     which = ", ".join(name for name in document["axes"] if name not in errors) + ": " if errors else ""

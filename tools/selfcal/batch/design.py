@@ -18,12 +18,12 @@ import numpy as np
 from scipy.signal import max_len_seq
 
 from selfcal.adequacy.drawn import simulate_bank_samples
-from selfcal.bank.result import HALF_90
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
 from selfcal.base.output import print_lines
 from selfcal.base.units import duration_words
-from selfcal.batch.plan import LEAST, MOST, Wish, bracket, part_of
+from selfcal.batch.plan import LENGTH_LEAST, LENGTH_MOST, Wish, bracket, part_of
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.response import answer_of
 from selfcal.diagnosis.separate import SHARE
@@ -36,7 +36,7 @@ from selfcal.model.file import Model
 #: Number of stages of the register that makes the bits.
 STAGES = 9
 #: Records that a length is tried with, and ratio of the next length to one that was too short.
-DRAWN, LONGER = 20, 1.2
+TRIED_RECORDS, LENGTH_RATIO = 20, 1.2
 LAG = Structure("lag", ("gain",), ("lag_s",))
 
 
@@ -92,7 +92,7 @@ def halves(experiment: Experiment, truth: Mapping[str, float], u: Array, dt: flo
 def designed(
     model: Model, axis: str, experiment: Experiment, wishes: Sequence[Wish], seeds: Sequence[int], scheduler: str | None
 ) -> dict[str, Any]:
-    """The shortest record of all bits: `bit_s`, `duration_s` (None beyond MOST samples), and what is predicted."""
+    """The shortest record of all bits: `bit_s`, `duration_s` (None beyond LENGTH_MOST), and what is predicted."""
     dt = 1.0 / model.bank_rate_hz
     parts = [
         {key: value for key, value in truth.items() if key in model.laws[law].parameters}
@@ -108,7 +108,7 @@ def designed(
 
     def length(bit_s: float) -> int | None:
         """Samples of the record."""
-        return bracket(partial(lacks, bit_s), max(LEAST, math.ceil(8.0 * bit_s / dt)))[1]
+        return bracket(partial(lacks, bit_s), max(LENGTH_LEAST, math.ceil(8.0 * bit_s / dt)))[1]
 
     bits = [max(times * experiment.lag_s, 2.0 * dt) for times in (0.5, 1.0, 2.0, 4.0)]
     reached = {bit_s: samples for bit_s in bits if (samples := length(bit_s)) is not None}
@@ -116,13 +116,13 @@ def designed(
         return {"bit_s": None, "duration_s": None}
     bit_s = min(reached, key=lambda bit: reached[bit])
     samples = reached[bit_s]
-    while samples <= MOST:
+    while samples <= LENGTH_MOST:
         # A record whose drift must be fitted, and its structure found, knows less than was predicted.
         of_record = partial(drawn_rows, model, axis, experiment, bit_s, samples)
         rows = spread(of_record, seeds, scheduler=scheduler)
         if np.mean([all(row[key] <= wish for key, wish in most.items()) for row in rows]) >= SHARE:
             return {"bit_s": bit_s, "duration_s": samples * dt}
-        samples = math.ceil(LONGER * samples)
+        samples = math.ceil(LENGTH_RATIO * samples)
     return {"bit_s": bit_s, "duration_s": None}
 
 

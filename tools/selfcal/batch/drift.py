@@ -24,7 +24,7 @@ from selfcal.readings.budget import FALSE_ALARM
 
 
 @dataclass(frozen=True)
-class Series:
+class DriftSeries:
     """A quantity of the device at place `at` over its recordings: `days` [n], `y` [n] (ln of it if `logarithm`) and its
     errors `s` [n]."""
 
@@ -55,7 +55,7 @@ class Series:
 class Drift:
     """The slope of a device's quantity, of its logarithm or of itself, a day; `log_p` of so steep a slope by chance."""
 
-    of: Series
+    of: DriftSeries
     per_day: float
     sd: float
     log_p: float
@@ -79,9 +79,9 @@ class Drift:
         }
 
 
-def drifts_of(series: Iterable[Series]) -> list[Drift]:
+def drifts_of(series: Iterable[DriftSeries]) -> list[Drift]:
     """The slope of each. Its quantities share FALSE_ALARM, the probability of a drift of a unit without drift."""
-    quantities: dict[str, list[Series]] = {}
+    quantities: dict[str, list[DriftSeries]] = {}
     of_unit: dict[int, int] = {}
     for history in series:
         quantities.setdefault(history.quantity, []).append(history)
@@ -102,7 +102,7 @@ def drifts_of(series: Iterable[Series]) -> list[Drift]:
     return drifts
 
 
-def _square(series: Sequence[Series]) -> float:
+def _square(series: Sequence[DriftSeries]) -> float:
     """r^2 of them all: 0 where their errors are scatter enough."""
     freedom = sum(history.freedom for history in series)
     high = max((float(np.var(history.y)) * history.y.size for history in series), default=0.0)
@@ -113,7 +113,7 @@ def _square(series: Sequence[Series]) -> float:
     return 0.0 if not freedom or enough(0.0) else bisected(enough, 0.0, high)[1]
 
 
-def _alike(series: Sequence[Series]) -> list[Series]:
+def _alike(series: Sequence[DriftSeries]) -> list[DriftSeries]:
     """Series that scatter alike: the others leave in rounds, each with the r of those that are left."""
     kept = list(series)
     while len(kept) > 1:

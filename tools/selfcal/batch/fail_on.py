@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from selfcal.base.ending import Held
+from selfcal.base.ending import HeldSignals
 from selfcal.base.errors import UserError, note
 from selfcal.batch.verdicts import PASS, Verdict, code_of, worst
 
@@ -15,7 +15,7 @@ INADEQUATE, MATERIAL, CHANGED = "inadequate", "material", "changed"
 
 
 @dataclass(frozen=True)
-class Outcome:
+class BatchOutcome:
     """Exit code: 0 every axis was judged and passed, 1 it applies to an axis, 2 an axis could not be judged. `lines`:
     the reasons, by axis."""
 
@@ -23,7 +23,7 @@ class Outcome:
     lines: list[str] = field(default_factory=list)
 
 
-def check(wanted: str | None, more: Collection[str] = ()) -> None:
+def check_cause(wanted: str | None, more: Collection[str] = ()) -> None:
     """Raise UserError for an unknown cause. `more`: further words of the verb."""
     if wanted is None:
         return
@@ -35,11 +35,11 @@ def check(wanted: str | None, more: Collection[str] = ()) -> None:
         raise UserError(f"--fail-on: there is no cause '{wanted}' ({', '.join(known)})")
 
 
-def outcome(document: Mapping[str, Any], wanted: str) -> Outcome:
+def outcome(document: Mapping[str, Any], wanted: str) -> BatchOutcome:
     """Exit code for a document of `identify`, `diagnose` or `compare`."""
     judged = list(_judged(document, wanted))
     lines = [line for applies, line in judged if not applies and line]
-    return Outcome(1 if any(applies for applies, _ in judged) else 2 if lines else 0, lines)
+    return BatchOutcome(1 if any(applies for applies, _ in judged) else 2 if lines else 0, lines)
 
 
 def _judged(document: Mapping[str, Any], wanted: str) -> Iterator[tuple[bool, str]]:
@@ -87,7 +87,7 @@ def _of_identify(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:
 def exit_code(document: Mapping[str, Any], wanted: str | None) -> int:
     """Exit code of what `--fail-on` and the limits make of a verb's answer, each reason on stderr. A signal that came
     ends the command here."""
-    Held().check()
+    HeldSignals().check()
     codes = [0]
     if wanted is not None:
         asked = outcome(document, wanted)

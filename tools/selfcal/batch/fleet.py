@@ -8,20 +8,20 @@ from typing import Any
 from selfcal.base.errors import MOST_NAMED
 from selfcal.base.output import print_lines
 from selfcal.batch.fail_on import outcome
-from selfcal.batch.unit_table import Unit
-from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge, unjudged
+from selfcal.batch.unit_table import BatchUnit
+from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge_limits, unjudged
 
 SCHEMA = "selfcal.fleet/1"
 
 
-def judged_units(batch: Sequence[Unit], limits: Limits) -> list[Judged]:
+def judged_units(batch: Sequence[BatchUnit], limits: Limits) -> list[Judged]:
     """The verdicts of each recording. A group's limit holds for the axes that any recording of the batch has."""
     stated = limits.of({name for unit in batch for name in unit.axes})
     return [
         (
             unit.device,
             unit.source.path,
-            judge(stated, unit.axes, unit.record["recording"]["duration_s"])
+            judge_limits(stated, unit.axes, unit.record["recording"]["duration_s"])
             if unit.error is None
             else unjudged(stated, unit.error),
         )
@@ -29,7 +29,7 @@ def judged_units(batch: Sequence[Unit], limits: Limits) -> list[Judged]:
     ]
 
 
-def document_with(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[Judged]) -> dict[str, Any]:
+def document_with(batch: Sequence[BatchUnit], fail_on: str | None, judged: Sequence[Judged]) -> dict[str, Any]:
     """The outcome of the batch, by device."""
     failed: dict[str, list[str]] = {}
     open_: dict[str, list[str]] = {}
@@ -63,7 +63,7 @@ def document_with(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[J
     }
 
 
-def _by_cause(unit: Unit, fail_on: str) -> tuple[list[str], list[str]]:
+def _by_cause(unit: BatchUnit, fail_on: str) -> tuple[list[str], list[str]]:
     """The axes that show it, and why others cannot be judged."""
     shown, lines = [], []
     diagnosis = unit.record.get("diagnosis", {})

@@ -12,10 +12,10 @@ from markupsafe import Markup
 
 from selfcal.base import units as unit_module
 from selfcal.base.grid import Array
-from selfcal.batch.batch_summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
+from selfcal.batch.batch_summary import Batch, group_lines, plain_interval, seen_from_words, unidentified_lines
 from selfcal.batch.population import Population
-from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, draw
-from selfcal.show.template import render
+from selfcal.show.chart import POINTS_MOST, Band, Curve, Figure, Panel, draw
+from selfcal.show.page_template import render
 
 #: Most of what the page shows: lines of a list, those not folded, units of the matrix, pictures.
 MOST_LINES, OPEN_LINES, MOST_ROWS, MOST_PICTURES = 150, 15, 100, 48
@@ -23,17 +23,14 @@ MOST_LINES, OPEN_LINES, MOST_ROWS, MOST_PICTURES = 150, 15, 100, 48
 KINDS = {
     "failed": ("Beyond a limit: set these aside", "beyond a limit, or with the cause asked for"),
     "unlike": ("Unlike the batch: look at these first", "unlike the batch"),
-    "drifting": (
-        "Drifting from recording to recording: measure these again, calibrate them more often",
-        "drifting",
-    ),
+    "drifting": ("Drifting from recording to recording: measure these again, calibrate them more often", "drifting"),
     "not_judged": ("Not judged: record these again, or longer", "not judged"),
 }
 #: Limits of a chart of individuals and of a chart of moving ranges (n = 2), over the mean moving range.
 INDIVIDUALS, RANGES = 2.66, 3.267
 
 
-def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) -> str:
+def fleet_html(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) -> str:
     """The page of the document `selfcal.fleet/1` and the batch that it is made of. `pages`: where the own page of a
     device is, from this page's folder on."""
     marked = _marked(batch)
@@ -46,7 +43,7 @@ def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) ->
         "commands": {name: f"selfcal diagnose {shlex.quote(path)} --report page.html" for name, path in paths.items()},
         "groups": list(group_lines(batch)),
         "populations": batch.populations,
-        "plain": plain,
+        "plain": plain_interval,
         "seen_from": seen_from_words,
         "unidentified": list(unidentified_lines(batch)),
         "distributions": _drawn(_histogram(population, document["limits"]) for population in histograms),
@@ -111,9 +108,9 @@ def _individuals(name: str, unit: str, y: Array) -> list[Figure]:
     ranges: Array = np.concatenate([np.full(1, np.nan), np.abs(np.diff(y))])
     mean, mean_range = float(y.mean()), float(np.nanmean(ranges))
     far, wide = np.abs(y - mean) > INDIVIDUALS * mean_range, ranges > RANGES * mean_range
-    every = max(1, math.ceil(y.size / POINTS))
+    every = max(1, math.ceil(y.size / POINTS_MOST))
     shown = np.arange(0, y.size, every)
-    shown = np.union1d(shown, np.flatnonzero(far | wide)[:POINTS])
+    shown = np.union1d(shown, np.flatnonzero(far | wide)[:POINTS_MOST])
     x = np.asarray(shown + 1.0, np.float64)
     whole: Array = np.ones(shown.size)
     low, high = mean - INDIVIDUALS * mean_range, mean + INDIVIDUALS * mean_range

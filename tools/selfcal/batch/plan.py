@@ -17,20 +17,19 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from selfcal.adequacy.allan import information_of, terms_of
+from selfcal.adequacy.allan import allan_terms, information_of
 from selfcal.adequacy.drawn import has_nodes, simulate_bank_samples
 from selfcal.adequacy.summary import MOST_TIMES
-from selfcal.bank.result import HALF_90
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, short
 from selfcal.base.grid import Array, bisected
-from selfcal.base.output import plotter, print_lines, save_picture
+from selfcal.base.output import print_lines
 from selfcal.base.units import duration_words
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.separate import SHARE
@@ -38,18 +37,17 @@ from selfcal.diagnosis.simulate import truth_of
 from selfcal.model.file import Model, Regressor
 from selfcal.model.forms import made
 from selfcal.model.laws import PLACES, Law
-from selfcal.model.regressors import channels_of, offered, sources_of
+from selfcal.model.regressors import channels_of, column_sources, offered
 from selfcal.model.tables import make_tables
-from selfcal.show.plot import COLORS
 
 SCHEMA = "selfcal.plan/1"
 #: Bank samples of the shortest record, and of the longest.
-LEAST, MOST = 64, 200_000
+LENGTH_LEAST, LENGTH_MOST = 64, 200_000
 #: Ratio of the rates of banks that a line compares, and largest ratio of the lengths that is worth a line: a slower
 #: bank may lengthen the record by the inverse.
-FASTER, WORTH = 10.0, 0.8
+RATE_RATIO, WORTH = 10.0, 0.8
 #: Largest ratio of two lengths, or of a bias' interval at half the length to the whole, that counts as 1.
-ALIKE = 1.1
+LENGTHS_ALIKE = 1.1
 #: Forms whose column is in proportion to the channel.
 LINEAR = ("static", "lag", "rate")
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
@@ -116,24 +114,24 @@ def column_of(regressor: Regressor, channel: Array, rate_hz: float) -> Array:
     """float64[n]: the column that a channel [n] at this rate makes. The window of a rate is of whole intervals."""
     if regressor.kind == "rate":
         regressor = replace(regressor, window_s=max(1, round(regressor.window_s * rate_hz)) / rate_hz)
-    return made(sources_of(regressor, channels_of((regressor,))), 1.0 / rate_hz, channel[:, None])[:, 0]
+    return made(column_sources(regressor, channels_of((regressor,))), 1.0 / rate_hz, channel[:, None])[:, 0]
 
 
 def bracket(lacks: Callable[[int], bool], least: int) -> tuple[int, int | None]:
     """The bank samples of the longest record tried that lacks something, 0 for none, and of a shortest one that has it:
-    longer by ALIKE at most, None beyond MOST."""
+    longer by LENGTHS_ALIKE at most, None beyond LENGTH_MOST."""
     low, high = 0, least
     while lacks(high):
         low, high = high, 2 * high
-        if high > MOST:
+        if high > LENGTH_MOST:
             return low, None
-    while low and high > ALIKE * low:
+    while low and high > LENGTHS_ALIKE * low:
         middle = int(math.sqrt(low * high))
         low, high = (middle, high) if lacks(middle) else (low, middle)
     return low, high
 
 
-class Ensemble:
+class PlannedRecords:
     """The records at each length that was asked for: metrics [records, wishes], NaN where a wish is not of the law."""
 
     def __init__(
@@ -178,8 +176,8 @@ class Ensemble:
         return math.log(max(float(np.quantile(metric, SHARE)), 1e-12) / self.wishes[k].most)
 
     def length(self, k: int) -> int | None:
-        """Bank samples at which the wish is reached; None beyond MOST."""
-        low, high = bracket(lambda samples: self.reached(k, samples) > 0.0, LEAST)
+        """Bank samples at which the wish is reached; None beyond LENGTH_MOST."""
+        low, high = bracket(lambda samples: self.reached(k, samples) > 0.0, LENGTH_LEAST)
         if high is None or not low:
             return high
         above, below = self.reached(k, low), self.reached(k, high)
@@ -208,7 +206,8 @@ def cycling(
         omega = np.array([2.0 * math.pi * cycles / samples])
         one_swing = column_of(regressor, swung(samples, cycles, 1.0), model.bank_rate_hz)
         power = [
-            float(terms_of(bare.laws[law], truth, 1.0 / model.bank_rate_hz).spectrum(omega)[0]) for law, truth in parts
+            float(allan_terms(bare.laws[law], truth, 1.0 / model.bank_rate_hz).spectrum(omega)[0])
+            for law, truth in parts
         ]
         swing = math.sqrt(float(np.quantile(power, SHARE)) * max(needed, 0.0) / (samples * float(one_swing.var())))
         if swing > 0.0:
@@ -316,7 +315,7 @@ def _times(half: Callable[[float, float], float], own_hz: float, rate_hz: float,
 def _half_interval(law: Law, truth: Mapping[str, float], parameter: str, rate_hz: float, duration_s: float) -> float:
     """Half of the 90 % interval of ln of a parameter, by the Fisher information; infinite where the record has none."""
     n = duration_s * rate_hz
-    if n < LEAST:
+    if n < LENGTH_LEAST:
         return math.inf
     try:
         covariance = np.linalg.inv(information_of(law, truth, 1.0 / rate_hz, n))
@@ -326,41 +325,16 @@ def _half_interval(law: Law, truth: Mapping[str, float], parameter: str, rate_hz
     return HALF_90 * math.sqrt(variance) if variance > 0.0 else math.inf
 
 
-def picture(document: Mapping[str, Any], path: Path | str) -> None:
-    """Draw the metrics over the length: median and middle four fifths of the records, and the wish."""
-    wishes = [wish for wish in document["wishes"] if wish["curve"]]
-    size = (7.0, 2.9 * len(wishes))
-    figure, panels = plotter().subplots(len(wishes), 1, figsize=size, squeeze=False, sharex=True)
-    for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
-        hours = np.array([point["duration_s"] for point in wish["curve"]]) / 3600.0
-        q10, q50, q90 = (np.maximum([point[key] for point in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))
-        panel.fill_between(hours, q10, q90, color=color, alpha=0.25, linewidth=0.0, label="four records of five")
-        panel.plot(hours, q50, color=color, label="median")
-        panel.axhline(wish["most"], color="black", linewidth=1.0, linestyle="--", label="wanted")
-        if wish["duration_s"] is not None:
-            panel.axvline(wish["duration_s"] / 3600.0, color="black", linewidth=1.0, linestyle=":", label="planned")
-        panel.set_xscale("log")
-        panel.set_yscale("log")
-        law = wish["wish"].startswith("law")
-        panel.set_ylabel("1 - P of the true law" if law else "half the 90 % interval")
-        panel.set_title(wish["wish"], loc="left", fontweight="bold")
-        panel.grid(True, which="major", alpha=0.3)
-        panel.legend(fontsize="x-small")
-    panels[-1, 0].set_xlabel("length of the recording, h")
-    figure.tight_layout()
-    save_picture(figure, path, dpi=110)
-
-
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """How long for each wish, in all, and what another rate would change."""
     print_lines(_lines(document), to_stderr=to_stderr)
 
 
-def steady(curve: Sequence[Mapping[str, float]]) -> float | None:
-    """What nine records of ten keep at the longest length, if half of that length has it too, but for ALIKE."""
+def steady_level(curve: Sequence[Mapping[str, float]]) -> float | None:
+    """What nine records of ten keep at the longest length, if half of that length has it too, but for LENGTHS_ALIKE."""
     longest = curve[-1]
     half = [point for point in curve if point["duration_s"] <= 0.5 * longest["duration_s"]]
-    return longest["q90"] if half and half[-1]["q90"] < ALIKE * longest["q90"] else None
+    return longest["q90"] if half and half[-1]["q90"] < LENGTHS_ALIKE * longest["q90"] else None
 
 
 def _swings(wish: Mapping[str, Any]) -> str:
@@ -379,14 +353,14 @@ def _lines(document: Mapping[str, Any]) -> list[str]:
         there = wish["duration_s"]
         said = "no length that can be simulated suffices" if there is None else f"record {duration_words(there)}"
         lines.append(f"{wish['wish']}: {_swings(wish) if 'cycling' in wish else said}")
-        if wish["wish"].startswith("bias") and (least := steady(wish["curve"])):
+        if wish["wish"].startswith("bias") and (least := steady_level(wish["curve"])):
             lines.append(f"  nine of ten such parts know it within {least:.2g} at any length: longer does not help")
         for rate in document["rates"]:
             times = math.nan if there is None or rate["wish"] != wish["wish"] else rate["duration_s"] / there
             factor = rate["rate_hz"] / document["rate_hz"]
-            if math.isclose(factor, FASTER) and times < WORTH:
+            if math.isclose(factor, RATE_RATIO) and times < WORTH:
                 lines.append(f"  by means at {rate['rate_hz']:g} Hz: {duration_words(rate['duration_s'])}")
-            if math.isclose(factor * FASTER, 1.0) and times < 1.0 / WORTH:
+            if math.isclose(factor * RATE_RATIO, 1.0) and times < 1.0 / WORTH:
                 lines.append(f"  means at {rate['rate_hz']:g} Hz suffice: {duration_words(rate['duration_s'])}")
     if document["duration_s"] is not None:
         lines.append(

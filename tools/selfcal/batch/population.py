@@ -25,14 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, log_ndtr, logsumexp, ndtri
 
-from selfcal.bank.result import HALF_90, of_mixture
-from selfcal.base.grid import Array, weighted_quantiles
+from selfcal.bank.axis_result import HALF_90, of_mixture
+from selfcal.base.grid import Array, Mask, weighted_quantiles
 from selfcal.readings.budget import FALSE_ALARM
 
 #: Fewest units of a population and of a group.
-FEWEST, FEWEST_OF_GROUP = 5, 3
+UNITS_LEAST, GROUP_UNITS_LEAST = 5, 3
 #: Points of the grid of spreads, and its reach from the spread of the estimates: of five units the tail weighs.
-_POINTS, _LEAST, _MOST = 160, 1e-3, 100.0
+_POINTS, _SPREAD_LEAST, _SPREAD_MOST = 160, 1e-3, 100.0
 #: Probability that a quantity calls any unit of a sound batch unlike.
 FALSE_NAME = 0.03
 #: Largest share of odd units, and the most numbers of odd units that are tried.
@@ -70,7 +70,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Fit:
+class PopulationFit:
     """A population: spreads `t` [p] with weights, mean and its variance at each."""
 
     t: Array
@@ -103,19 +103,19 @@ class Fit:
         return _tail(self.weight, (y[:, None] - self.mean) / sd)
 
 
-def fit(y: Array, s: Array) -> Fit:
+def fit_population(y: Array, s: Array) -> PopulationFit:
     """The population of measured `y` [n] with errors `s` [n]."""
     t, weight, mean, variance = _on_grid(y, s, np.ones((1, y.size), np.bool_))
-    return Fit(t, weight, mean[0], variance[0])
+    return PopulationFit(t, weight, mean[0], variance[0])
 
 
-def _on_grid(y: Array, s: Array, sides: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
+def _on_grid(y: Array, s: Array, sides: Mask) -> tuple[Array, Array, Array, Array]:
     """Spreads [p] and their weights [p], with the mean of each side and its variance [sides, p]. Each unit is on one of
     the `sides` [sides, n], which have one spread."""
     errors = s**2
     residual = y - sum(side * y[side].mean() for side in sides)
     scale = math.sqrt(float(residual @ residual) / (y.size - len(sides)) + float(np.median(errors)))
-    t = scale * np.geomspace(_LEAST, _MOST, _POINTS)
+    t = scale * np.geomspace(_SPREAD_LEAST, _SPREAD_MOST, _POINTS)
     w = 1.0 / (t[:, None] ** 2 + errors)
     total = w @ sides.T
     mean = (w @ (sides * y).T) / total
@@ -170,9 +170,9 @@ class Population:
     `offset` [n] of each unit by its groups. `seen_from`: how far off a unit with the usual error is unlike."""
 
     measured: Measured
-    fit: Fit
+    fit: PopulationFit
     offset: Array
-    kept: NDArray[np.bool_]
+    kept: Mask
     seen_from: float
     apart: tuple[Apart, ...] = ()
     unlike: tuple[Unlike, ...] = field(default=())
@@ -205,7 +205,7 @@ def populations(
 
     `odd`: by axis, places of units that are unlike by anything else. FALSE_NAME is shared among all units and
     quantities, FALSE_ALARM among all groups and quantities."""
-    tested = [quantity for quantity in measured if quantity.y.size >= FEWEST]
+    tested = [quantity for quantity in measured if quantity.y.size >= UNITS_LEAST]
     limit = math.log(FALSE_NAME / max(1, sum(quantity.y.size for quantity in tested)))
     groups = _groups(groupings)
     group_limit = math.log(FALSE_ALARM / max(1, len(groups) * len(tested)))
@@ -228,7 +228,7 @@ def populations(
 
 def _is_group(inside: int, units: int) -> bool:
     """Whether `inside` of the units are a group among the others: at most half, and neither side too small."""
-    return FEWEST_OF_GROUP <= inside <= 0.5 * units and units - inside >= FEWEST_OF_GROUP
+    return GROUP_UNITS_LEAST <= inside <= 0.5 * units and units - inside >= GROUP_UNITS_LEAST
 
 
 #: Groups that a test can separate, by the places of their units: kind, name and the only other name of each.
@@ -267,16 +267,16 @@ def _population(measured: Measured, apart: Sequence[Apart], others: Set[int], li
         offset = np.sum([np.zeros(measured.y.size), *(group.shift(measured.at) for group in apart)], axis=0)
         centred = measured.y - offset
         own = ~np.isin(measured.at, list(others))
-        if own.sum() < FEWEST:
+        if own.sum() < UNITS_LEAST:
             own[:] = True
-        own |= fit(centred[own], measured.s[own]).log_p(centred, measured.s) > math.log(0.01)
+        own |= fit_population(centred[own], measured.s[own]).log_p(centred, measured.s) > math.log(0.01)
         kept = own.copy()
         kept[own] = _kept(centred[own], measured.s[own], limit)
         split = None if apart and apart[-1].kind == TWO_GROUPS else _split(measured, centred, kept)
         if split is None:
             break
         apart.append(split)
-    population = fit(centred[kept], measured.s[kept])
+    population = fit_population(centred[kept], measured.s[kept])
     log_p = population.log_p(centred, measured.s)
     off = centred - population.middle.median
     unlike = [
@@ -291,44 +291,44 @@ def _seen_from(y: Array, s: Array, limit: float) -> float:
     """How far off a unit is unlike, at ln probability `limit`, by all others of the population `y` [n]: the unit that
     is odd makes them one fewer, so the unit nearest to their mean leaves."""
     fewer = np.arange(y.size) != int(np.argmin(np.abs(y - np.median(y))))
-    others = fit(y[fewer], s[fewer])
+    others = fit_population(y[fewer], s[fewer])
     error = float(np.median(s))
     off = math.hypot(others.spread.median, error) * np.geomspace(0.5, 500.0, 400)
     log_p = others.log_p(others.middle.median + off, np.full(off.size, error))
     return float(np.exp(np.interp(-limit, -log_p, np.log(off))))
 
 
-def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
+def _kept(y: Array, s: Array, limit: float) -> Mask:
     """The units [n] that are not odd: `limit` is the ln probability of an odd unit."""
     middle, spread = robust(y, s)
     order = np.argsort(-np.abs(y - middle) / np.hypot(spread, s))
-    most = min(math.ceil(MOST_ODD * y.size), y.size - FEWEST)
+    most = min(math.ceil(MOST_ODD * y.size), y.size - UNITS_LEAST)
     for k in sorted({round(count) for count in np.geomspace(1.0, max(most, 1), _TRIED)} if most > 0 else [])[::-1]:
         rest = order[k:]
-        others = fit(y[rest], s[rest])
+        others = fit_population(y[rest], s[rest])
         if others.log_p(y[order[k - 1 : k]], s[order[k - 1 : k]])[0] <= limit:
-            kept: NDArray[np.bool_] = others.log_p(y, s) > limit
+            kept: Mask = others.log_p(y, s) > limit
             kept[rest] = True
             return kept
     return np.ones(y.size, np.bool_)
 
 
-def _split(measured: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
+def _split(measured: Measured, y: Array, kept: Mask) -> Apart | None:
     """The smaller of two groups in which the units lie, if two are better than a single group by _SPLIT.
 
     Each cut of the sorted units gives two normals of one spread. Their likelihood counts each unit's group as drawn."""
     order = np.flatnonzero(kept)[np.argsort(y[kept])]
     x, s, n = y[order] - y[kept].mean(), measured.s[order], order.size
-    if n < 2 * FEWEST_OF_GROUP:
+    if n < 2 * GROUP_UNITS_LEAST:
         return None
     spread = float(np.std(x)) * np.geomspace(0.03, 3.0, _POINTS)
     w = 1.0 / (spread[:, None] ** 2 + s**2)
     sums = np.stack([np.cumsum(w * x**power, axis=1) for power in range(3)])
-    low, whole = sums[..., FEWEST_OF_GROUP - 1 : n - FEWEST_OF_GROUP], sums[..., -1:]
+    low, whole = sums[..., GROUP_UNITS_LEAST - 1 : n - GROUP_UNITS_LEAST], sums[..., -1:]
     squares = [part[2] - part[1] ** 2 / part[0] for part in (low, whole - low, whole)]
     ln = 0.5 * np.log(w).sum(axis=1)
     two = ln[:, None] - 0.5 * (squares[0] + squares[1])
-    below = np.arange(FEWEST_OF_GROUP, n - FEWEST_OF_GROUP + 1)
+    below = np.arange(GROUP_UNITS_LEAST, n - GROUP_UNITS_LEAST + 1)
     gain = two.max(axis=0) - (ln - 0.5 * squares[2][:, 0]).max()
     gain += below * np.log(below / n) + (n - below) * np.log1p(-below / n)
     cut = int(np.argmax(gain))
@@ -366,7 +366,7 @@ def _most_apart(measured: Measured, y: Array, groups: Groups, limit: float, grou
     return None
 
 
-def _by_medians(y: Array, s: Array, inside: NDArray[np.bool_]) -> float:
+def _by_medians(y: Array, s: Array, inside: Mask) -> float:
     """ln of the probability that the medians of two sides differ as they do, by robust spreads of many units."""
     spread = max(robust(y[side], s[side])[1] for side in (inside, ~inside))
     difference = float(np.median(y[inside]) - np.median(y[~inside]))
@@ -375,13 +375,13 @@ def _by_medians(y: Array, s: Array, inside: NDArray[np.bool_]) -> float:
     return math.log(2.0) + float(log_ndtr(-abs(difference) / math.sqrt(sum(variance))))
 
 
-def _difference(y: Array, s: Array, inside: NDArray[np.bool_], limit: float) -> tuple[float, float]:
+def _difference(y: Array, s: Array, inside: Mask, limit: float) -> tuple[float, float]:
     """By how much the units `inside` [n] differ from the others, and ln of the probability that chance does it.
 
     Units that are odd on their own side count on neither."""
     side_of = np.where(inside, np.median(y[inside]), np.median(y[~inside]))
     kept = _kept(y - side_of, s, limit)
-    if min((kept & inside).sum(), (kept & ~inside).sum()) < FEWEST_OF_GROUP:
+    if min((kept & inside).sum(), (kept & ~inside).sum()) < GROUP_UNITS_LEAST:
         return 0.0, 0.0
     _, weight, mean, variance = _on_grid(y[kept], s[kept], np.array([inside[kept], ~inside[kept]]))
     difference, sd = mean[0] - mean[1], np.sqrt(variance.sum(axis=0))

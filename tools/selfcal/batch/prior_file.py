@@ -57,7 +57,7 @@ def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[
     return priors
 
 
-def lines_of(priors: Mapping[str, Mapping[str, Prior]], model: Model) -> Iterator[str]:
+def prior_lines(priors: Mapping[str, Mapping[str, Prior]], model: Model) -> Iterator[str]:
     """A line for each prior."""
     for axis, own in priors.items():
         for name, prior in own.items():

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, TextColumn
 
-from selfcal.base.errors import UserError, first_line, install, printable, shown
+from selfcal.base.errors import UserError, first_line, install_line, printable, short_value
 from selfcal.base.output import temporary_folder, whole
 from selfcal.base.progress import Doing
 from selfcal.base.units import duration_words
@@ -92,7 +92,7 @@ def record_seeds(records: int, seed: int) -> list[int]:
 def checked_seed(seed: int) -> int:
     """The seed. Raises UserError for a seed that the simulator does not take."""
     if not 0 <= seed < SEEDS:
-        raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {shown(seed)}")
+        raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {short_value(seed)}")
     return seed
 
 
@@ -245,7 +245,7 @@ def _cluster(
     lost: Callable[[Job], list[Row]] | None,
 ) -> Iterator[tuple[int, list[Row]]]:
     if importlib.util.find_spec("distributed") is None:
-        raise UserError(f"--scheduler needs dask.distributed: {install('distributed')}")
+        raise UserError(f"--scheduler needs dask.distributed: {install_line('distributed')}")
     import distributed
 
     try:

@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 
 from selfcal.base.errors import MOST_NAMED, UserError, first_line
 from selfcal.batch.spread import Job, Kept, Row, spread
-from selfcal.batch.unit_table import Unit
-from selfcal.readings.tests import TESTS
+from selfcal.batch.unit_table import BatchUnit
+from selfcal.readings.faults import FAULTS
 
 #: Keys kept of an axis of `identify`, and of an axis of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error")
 #: Checks of the readings, and of the innovations.
-READINGS = tuple(test.name for test in TESTS)
+READINGS = tuple(fault.name for fault in FAULTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 #: Characters that the name of a device's page lacks.
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
@@ -82,7 +82,7 @@ def _record(verbs: Verbs, options: Options, path: str) -> Row:
 def own_pages(
     folder: Path | str,
     names: Sequence[str],
-    devices: Mapping[str, Sequence[Unit]],
+    devices: Mapping[str, Sequence[BatchUnit]],
     verbs: Verbs,
     options: Options,
     kept: Kept,
@@ -133,7 +133,7 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     return {"marks": list(dict.fromkeys(marks)), **stated}
 
 
-def settings_of(options: Options, model: str, version: str) -> dict[str, Any]:
+def record_settings(options: Options, model: str, version: str) -> dict[str, Any]:
     """All that decides a record apart from its recording; `model`: its content."""
     kept = [*IDENTIFIED, *DIAGNOSED]
     return {"schema": "selfcal.fleet/1", "kept": kept, **asdict(options), "model": model, "version": version}

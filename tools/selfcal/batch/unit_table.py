@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from selfcal.bank.result import bias_of, likeliest
-from selfcal.base.errors import UserError, cell, install
+from selfcal.bank.axis_result import bias_of, likeliest
+from selfcal.base.errors import UserError, cell, install_line
 from selfcal.base.output import whole
-from selfcal.batch.files import Source, moment, stem
+from selfcal.batch.batch_files import BatchSource, moment, stem
 
 COLUMNS = (
     *("device", "recording", "recorded_at", "station", "lot", "sha256", "version", "axis", "parameter"),
@@ -22,10 +22,10 @@ _NUMBERS = ("median", "q05", "q95", "probability")
 SUFFIXES = (".csv", ".parquet")
 
 
-class Unit:
+class BatchUnit:
     """One recording of the batch with its answer: `record` (batch/unit_record.py), or `error`."""
 
-    def __init__(self, source: Source, record: Mapping[str, Any]) -> None:
+    def __init__(self, source: BatchSource, record: Mapping[str, Any]) -> None:
         recording = record.get("recording", {})
         self.source, self.record = source, record
         self.device: str = source.device or recording.get("serial", "") or stem(source.path)
@@ -59,7 +59,7 @@ class Unit:
         return set(self.causes(axis)) - {"unexplained", *self.causes(axis, "material")}
 
 
-def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
+def unit_rows(unit: BatchUnit, version: str) -> Iterator[dict[str, Any]]:
     """The rows of a recording. A recording, or an axis, without a result is a row with its `error`."""
     source = unit.source
     head = dict(zip(COLUMNS, (unit.device, source.path, unit.recorded_at, source.station, source.lot), strict=False))
@@ -90,7 +90,7 @@ def check_table(path: Path | str) -> None:
     if Path(path).suffix not in SUFFIXES:
         raise UserError(f"{path}: the table's name ends in {' or '.join(SUFFIXES)}")
     if Path(path).suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
-        raise UserError(f"{path}: Parquet needs pyarrow: {install('pyarrow')}, or write a .csv")
+        raise UserError(f"{path}: Parquet needs pyarrow: {install_line('pyarrow')}, or write a .csv")
 
 
 def write_table(path: Path | str, rows: Iterator[dict[str, Any]]) -> None:

@@ -20,10 +20,10 @@ from statistics import NormalDist
 from typing import Any
 
 from selfcal.adequacy.summary import MOST_TIMES
-from selfcal.bank.result import HALF_90, bias_of, likeliest
+from selfcal.bank.axis_result import HALF_90, bias_of, likeliest
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
-from selfcal.base.errors import UserError, printable, shown
+from selfcal.base.errors import UserError, printable, short_value
 from selfcal.base.grid import bisected
 from selfcal.base.output import check_writable, whole
 from selfcal.base.units import duration_words
@@ -118,12 +118,12 @@ class Limits:
             name, _, parameter = str(key).partition(".")
             if name not in groups and name not in model.axes:
                 known = ", ".join((*groups, *model.axes))
-                raise UserError(f"{file}: {shown(key)}: begins with no group or axis of the model ({known})")
+                raise UserError(f"{file}: {short_value(key)}: begins with no group or axis of the model ({known})")
             group = groups[name] if name in groups else model.group_of(name)
             if parameter not in ("bias", *PLACES):
-                raise UserError(f"{file}: {shown(key)}: ends with none of bias, {', '.join(PLACES)}")
+                raise UserError(f"{file}: {short_value(key)}: ends with none of bias, {', '.join(PLACES)}")
             if not isinstance(entry, dict) or not entry or not set(entry) <= {"min", "max"}:
-                raise UserError(f"{file}: {shown(key)}: takes {{max: VALUE UNIT}}, {{min: VALUE UNIT}} or both")
+                raise UserError(f"{file}: {short_value(key)}: takes {{max: VALUE UNIT}}, {{min: VALUE UNIT}} or both")
             unit = units.parameter_unit(parameter, group.unit)
             for side, text in entry.items():
                 value, of = _quantity(f"{file}: {key}.{side}", text, unit)
@@ -144,7 +144,7 @@ class Limits:
 
 def _quantity(where: str, text: Any, like: str) -> tuple[float, str]:
     """Value and unit of a text such as `0.014 deg/s/sqrt(Hz)`, of the kind of `like`."""
-    wanted = f"takes a number and a unit as {like}, not {shown(text)}"
+    wanted = f"takes a number and a unit as {like}, not {short_value(text)}"
     try:
         value, unit = units.quantity(str(text))
         unit = unit or ("1" if like == "1" else "")
@@ -156,7 +156,7 @@ def _quantity(where: str, text: Any, like: str) -> tuple[float, str]:
     return value, unit
 
 
-def judge(limits: Iterable[Limit], axes: Mapping[str, Any], duration_s: float) -> list[Verdict]:
+def judge_limits(limits: Iterable[Limit], axes: Mapping[str, Any], duration_s: float) -> list[Verdict]:
     """The verdicts of one recording of `duration_s`; `axes`: those of the document of `identify`, or with a
     `posterior` those of `diagnose`."""
     return [_judged(limit, axes.get(limit.axis), duration_s) for limit in limits]
@@ -306,7 +306,7 @@ def write_unjudged(given: Mapping[str, Any], reason: str) -> None:
     check_writable(*files, inputs=(*logs, given["limits"], given.get("model")))
     model = Model.load(given.get("model"))
     limits = Limits.load(given["limits"], model).of(given.get("axes") or model.axes)
-    write([("", " ".join(map(str, logs)), unjudged(limits, reason))], *files)
+    write_verdicts([("", " ".join(map(str, logs)), unjudged(limits, reason))], *files)
 
 
 def check_options(limits: Path | str | None, junit: Path | str | None, verdicts: Path | str | None) -> None:
@@ -315,10 +315,10 @@ def check_options(limits: Path | str | None, junit: Path | str | None, verdicts:
         raise UserError("--junit and --verdicts are of the limits' verdicts: give --limits LIMITS.yaml too")
 
 
-def write(judged: Sequence[Judged], junit: Path | str | None, verdicts: Path | str | None) -> None:
+def write_verdicts(judged: Sequence[Judged], junit: Path | str | None, verdicts: Path | str | None) -> None:
     """Write the files that are asked for: JUnit, and a CSV of a row for each limit of each recording. A recording
     without a device has its file's name."""
-    from selfcal.batch.files import stem
+    from selfcal.batch.batch_files import stem
     from selfcal.batch.unit_table import write_csv
 
     named = [(device or stem(recording), recording, of_unit) for device, recording, of_unit in judged]
@@ -340,6 +340,6 @@ def add_verdicts(
     if limits is None:
         return
     axes, recording = document["axes"], document["recording"]
-    judged = judge(limits.of(axes), axes, recording["duration_s"])
+    judged = judge_limits(limits.of(axes), axes, recording["duration_s"])
     document["limits"] = [verdict.entry() for verdict in judged]
-    write([(recording.get("serial", ""), recording["path"], judged)], junit, verdicts)
+    write_verdicts([(recording.get("serial", ""), recording["path"], judged)], junit, verdicts)

@@ -16,8 +16,8 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask, slices
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import drift
-from selfcal.calibration.rests import ACCEL, REST_S, Tumble
-from selfcal.calibration.tumble_fit import Fit, Problem, fit
+from selfcal.calibration.tumble_fit import Problem, TumbleFit, fit_tumble
+from selfcal.calibration.tumble_rests import ACCEL, REST_LEAST_S, Tumble
 from selfcal.readings.budget import FALSE_ALARM
 
 #: Stated priors, sd, of lib/tumble.h: bias, m/s^2 (100 mg); scale; angle, rad; square of the scale, s^2/m.
@@ -43,7 +43,7 @@ REACH: float = _library32.TUMBLE_REACH
 class Accelerometer:
     """The answer: its fit, the rests that it is of, and gravity."""
 
-    fit: Fit
+    fit: TumbleFit
     tumble: Tumble
     place: Place
 
@@ -56,11 +56,11 @@ class Accelerometer:
         """Specific force [n, 3], m/s^2, of readings [n, 3] at temperatures [n] about the mean."""
         return forces(self.fit.theta, a, warmth)[0]
 
-    def refitted(self, held: Mask) -> Fit:
+    def refitted(self, held: Mask) -> TumbleFit:
         """The fit with some parameters [n], and squares of the scale, held at 0 error: what a format cannot state. So
         it comes nearest at 1 g."""
         mean, prior = _prior(self.tumble, self.place)
-        return fit(_problem(self.tumble, self.place, 0.0), mean, mean, prior, held)
+        return fit_tumble(_problem(self.tumble, self.place, 0.0), mean, mean, prior, held)
 
 
 def shaped(scale: Array, angles: Array, places: Sequence[tuple[int, int]]) -> Array:
@@ -123,7 +123,7 @@ def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
     """The accelerometers by all rests. Raises UserError for fewer rests than biases."""
     if len(tumble.rests) < len(ACCEL):
         raise UserError(
-            f"{len(tumble.rests)} rests found, {len(ACCEL)} are needed: rest the part {REST_S:g} s or longer in "
+            f"{len(tumble.rests)} rests found, {len(ACCEL)} are needed: rest the part {REST_LEAST_S:g} s or longer in "
             "each of six positions or more"
         )
     mean, prior = _prior(tumble, place)

@@ -25,8 +25,8 @@ from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
 from selfcal.calibration.accelerometer import ANGLE_SD, NONE, SCALE_SD, Accelerometer, forces, means_covariance, shaped
 from selfcal.calibration.noise import drift
-from selfcal.calibration.rests import GYRO, Tumble, Turn
-from selfcal.calibration.tumble_fit import Fit, Problem
+from selfcal.calibration.tumble_fit import Problem, TumbleFit
+from selfcal.calibration.tumble_rests import GYRO, Tumble, Turn
 
 #: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); temperature coefficient,
 #: rad/s/degC (0.05 deg/s/degC). Scale and angles have the accelerometers'.
@@ -35,7 +35,7 @@ BIAS_SD, G_SD, THERMAL_SD = math.radians(10.0), math.radians(0.1), math.radians(
 OF_ACCEL = accelerometer.THERMAL.stop
 #: Windows of a turn that show signs and units, s; largest error of a gyro's factor; least share of the most turned
 #: axis, or of a turn, that is judged; information that is added to every entry of the factors.
-WINDOW_S, WRONG, SHOWN, FAINT = 0.2, 0.3, 0.3, 1e-3
+TURN_WINDOW_S, FACTOR_ERROR_MOST, TURNED_SHARE_LEAST, ADDED_INFORMATION = 0.2, 0.3, 0.3, 1e-3
 #: Numbers of the parameters, and their places behind the accelerometers'; the Earth's vertical rate has an index, its
 #: level parts follow for each chain of turns.
 SIZES = (3, 9, 3, 6, 1, 3)
@@ -49,7 +49,7 @@ PLACES = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 class Gyroscope:
     """The answer: its fit, of which the first `of_accel` parameters are the accelerometers', and the turns."""
 
-    fit: Fit
+    fit: TumbleFit
     of_accel: int
     turns: tuple[Turn, ...]
 
@@ -91,7 +91,7 @@ def fault_of(accel: Accelerometer) -> str:
     by u x w, which is linear in the rates: M [3, 3] of w = M y needs no start. An axis of few turns is not judged."""
     rests, moves, angles, middles = accel.tumble.rests, [], [], []
     for turn in (turn for turn in accel.tumble.turns if not turn.reason):
-        size = max(2, round(WINDOW_S / turn.dt))
+        size = max(2, round(TURN_WINDOW_S / turn.dt))
         first = np.arange(0, len(turn.accel) - size, size)
         f = accel.force(turn.accel, np.zeros(len(turn.accel)))
         u = f / np.linalg.norm(f, axis=1)[:, None]
@@ -105,27 +105,27 @@ def fault_of(accel: Accelerometer) -> str:
     moved, angle, u = (np.concatenate(part) for part in (moves, angles, middles))
     turned, measured = np.linalg.norm(np.cross(u, moved), axis=0), np.linalg.norm(angle, axis=0)
     columns = (cross(u)[:, :, :, None] * (angle / np.maximum(measured, 1e-12))[:, None, None, :]).reshape(-1, 9)
-    inverse = np.linalg.inv(columns.T @ columns + FAINT * np.eye(9))
+    inverse = np.linalg.inv(columns.T @ columns + ADDED_INFORMATION * np.eye(9))
     factors = inverse @ columns.T @ moved.ravel()
     sd = np.sqrt(np.mean((moved.ravel() - columns @ factors) ** 2) * np.diag(inverse)).reshape(3, 3)
     said = dict[str, list[str]]()
-    for k in np.flatnonzero(turned > SHOWN * turned.max()).tolist():
+    for k in np.flatnonzero(turned > TURNED_SHARE_LEAST * turned.max()).tolist():
         axis = int(np.abs(factors.reshape(3, 3)[k]).argmax())
         share, value = (float(factors[3 * k + axis] / max(length, 1e-12)) for length in (turned[k], measured[axis]))
-        if axis == k and abs(value - 1.0) < WRONG + 4.0 * float(sd[k, axis] / max(measured[axis], 1e-12)):
+        if axis == k and abs(value - 1.0) < FACTOR_ERROR_MOST + 4.0 * float(sd[k, axis] / max(measured[axis], 1e-12)):
             continue
         words = [f"has the turns about {'xyz'[k]}"] * (axis != k) + ["is of the other sign"] * (value < 0.0)
-        if not 1.0 - WRONG < abs(value) < 1.0 + WRONG:
+        if not 1.0 - FACTOR_ERROR_MOST < abs(value) < 1.0 + FACTOR_ERROR_MOST:
             # Units that are taken for each other.
             units = [
                 unit
                 for unit, size in (("deg/s", math.radians(1.0)), ("rad/s", math.degrees(1.0)))
-                if abs(math.log(abs(value) / size)) < WRONG
+                if abs(math.log(abs(value) / size)) < FACTOR_ERROR_MOST
             ]
             words.append(
                 f"reads as if its unit were {units[0]}" if units else f"reads {1 / abs(value):.2g} times the rate"
             )
-        if abs(share) < SHOWN:
+        if abs(share) < TURNED_SHARE_LEAST:
             axis, words = k, ["does not show its turns"]
         said.setdefault(" and ".join(words), []).append(GYRO[axis])
     return "; ".join(f"{'each of ' * (len(who) > 1)}{', '.join(who)} {words}" for words, who in said.items())

@@ -15,8 +15,8 @@ import numpy as np
 from scipy.special import hyp1f1
 
 from selfcal.adequacy.identify import identify_axis
-from selfcal.bank.blocks import FEWEST
-from selfcal.bank.priors import known, laid
+from selfcal.bank.blocks import BLOCKS_LEAST
+from selfcal.bank.priors import laid, noise_is_known
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
 from selfcal.base.units import factor
@@ -29,7 +29,7 @@ LONG_S = 1200.0
 
 
 @dataclass(frozen=True)
-class Term:
+class DriftTerm:
     """A term of the drift with its probability in it: `square` is K^2 of a walk (`alpha` 0), or sigma_m^2."""
 
     square: float
@@ -42,7 +42,7 @@ class Noise:
     `wide`: the terms are those of a prior that spans decades: residuals may show that they are less."""
 
     white: float
-    terms: tuple[Term, ...]
+    terms: tuple[DriftTerm, ...]
     words: str
     wide: bool = False
 
@@ -51,7 +51,7 @@ class Noise:
         if not self.wide:
             return self
         terms = zip(shares.tolist(), self.terms, strict=True)
-        return replace(self, terms=tuple(Term(share * term.square, term.alpha) for share, term in terms))
+        return replace(self, terms=tuple(DriftTerm(share * term.square, term.alpha) for share, term in terms))
 
 
 def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Array:
@@ -89,17 +89,17 @@ def mean_square(prior: Prior) -> float:
 
 def of_laws(
     laws: Mapping[str, Law], probability: Mapping[str, float], values: Mapping[str, Mapping[str, tuple[float, float]]]
-) -> tuple[Term, ...]:
+) -> tuple[DriftTerm, ...]:
     """Terms of a mixture of laws. `values`: by law and parameter the mean square and the median. An oscillation counts
     as a Gauss-Markov drift of its period."""
-    total, terms = sum(probability.values()), list[Term]()
+    total, terms = sum(probability.values()), list[DriftTerm]()
     for name, share in probability.items():
         law, own = laws[name], values[name]
         if not law.terms or not share > 0.0:
             continue
         square = share / total * own[law.parameters[1]][0]
         sized = law.sized(math.sqrt(square), own[law.second][1] if law.second else 1.0)
-        terms += [Term(term.variance, term.rate) for term in sized]
+        terms += [DriftTerm(term.variance, term.rate) for term in sized]
     return tuple(terms)
 
 
@@ -109,13 +109,15 @@ def of_model(model: Model, axis: str, unit: str, N: float | None) -> Noise:
     group = model.group_of(axis)
     size = factor(group.unit, unit)
     priors, words = group.priors, f"{model.name}"
-    if not known(group):
+    if not noise_is_known(group):
         words = f"not known: the prior of {model.name}, weighed by this log"
         priors = laid(priors, N / size) if N is not None else priors
     middle = {key: (mean_square(prior), prior.median) for key, prior in priors.items() if key != "bias"}
     terms = of_laws(model.laws, model.hypotheses, dict.fromkeys(model.laws, middle))
     white = size**2 * middle["N"][0] if N is None else N**2
-    return Noise(white, tuple(Term(size**2 * term.square, term.alpha) for term in terms), words, not known(group))
+    return Noise(
+        white, tuple(DriftTerm(size**2 * term.square, term.alpha) for term in terms), words, not noise_is_known(group)
+    )
 
 
 def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise | None:
@@ -134,19 +136,19 @@ def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise |
     white = sum(share * values[law]["N"][0] for law, share in result.probability.items())
     return Noise(
         size * white,
-        tuple(Term(size * term.square, term.alpha) for term in terms),
+        tuple(DriftTerm(size * term.square, term.alpha) for term in terms),
         f"{recording.duration_s:.0f} s at rest",
     )
 
 
-def measured(pieces: Sequence[Array], piece_s: float) -> float | None:
+def measured_noise(pieces: Sequence[Array], piece_s: float) -> float | None:
     """N^2 by the differences of neighbouring means of `piece_s` s within rests [k] each; None of too few."""
     steps = np.concatenate([np.diff(piece) for piece in pieces]) if pieces else np.zeros(0)
     steps = steps[np.isfinite(steps)]
-    return float(np.mean(steps**2)) * 0.5 * piece_s if steps.size >= FEWEST else None
+    return float(np.mean(steps**2)) * 0.5 * piece_s if steps.size >= BLOCKS_LEAST else None
 
 
-def rounding(step: float, noise: float) -> float:
+def rounding_variance(step: float, noise: float) -> float:
     """Variance of the mean of readings rounded to a lattice with noise of a sd too small to dither it: harmonics of
     the sawtooth (Widrow and Kollar, "Quantization Noise", 2008, chapter 4)."""
     if step <= 0.0:

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.adequacy.document import recording_entry
-from selfcal.bank.result import HALF_90
+from selfcal.adequacy.identify_document import recording_entry
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base.grid import Array
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
 from selfcal.calibration.gyroscope import Gyroscope
-from selfcal.calibration.rests import ACCEL, GYRO, Tumble
-from selfcal.calibration.tumble_fit import IDENTIFIED, Fit
+from selfcal.calibration.tumble_fit import VARIANCE_LEFT_MOST, TumbleFit
 from selfcal.calibration.tumble_plan import EDGES, FLATS, OPPOSITE
+from selfcal.calibration.tumble_rests import ACCEL, GYRO, Tumble
 from selfcal.logs.recording import Recording
 from selfcal.readings.budget import FALSE_ALARM
 
@@ -40,7 +40,9 @@ OF_GYRO = (
 )
 
 
-def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyroscope | str | None) -> dict[str, Any]:
+def tumble_document(
+    recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyroscope | str | None
+) -> dict[str, Any]:
     """The whole answer, in SI units and degrees. `gyro`: None without gyros, a line where they have no answer."""
     place, tumble = accel.place, accel.tumble
     notes = [*tumble.notes, *(f"{text}: left out" for text in tumble.left_out), *_notes_of_turns(accel)]
@@ -87,7 +89,7 @@ def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyr
     }
 
 
-def _entry(fit: Fit, k: int, unit: str, size: float) -> dict[str, Any]:
+def _entry(fit: TumbleFit, k: int, unit: str, size: float) -> dict[str, Any]:
     """A parameter; no number of one that is not identified."""
     identified = bool(fit.identified[k])
     value, sd = size * float(fit.theta[k]), size * math.sqrt(float(fit.covariance[k, k]))
@@ -96,7 +98,7 @@ def _entry(fit: Fit, k: int, unit: str, size: float) -> dict[str, Any]:
     return {**(numbers if identified else dict.fromkeys(numbers)), "unit": unit, "identified": identified}
 
 
-def _entries(tumble: Tumble, fit: Fit, start: int, names: Sequence[tuple[str, str, str]]) -> dict[str, Any]:
+def _entries(tumble: Tumble, fit: TumbleFit, start: int, names: Sequence[tuple[str, str, str]]) -> dict[str, Any]:
     """Parameters from `start` on by group and name; temperature coefficients where the logs have a temperature."""
     entries: dict[str, Any] = {}
     for k, (group, name, unit) in enumerate(names, start):
@@ -106,7 +108,7 @@ def _entries(tumble: Tumble, fit: Fit, start: int, names: Sequence[tuple[str, st
     return entries | ({"bias_at_degC": float(tumble.temp.mean())} if tumble.has_temp else {})
 
 
-def _adequacy(fit: Fit, causes: Sequence[tuple[str, float]]) -> dict[str, Any]:
+def _adequacy(fit: TumbleFit, causes: Sequence[tuple[str, float]]) -> dict[str, Any]:
     """Whether the residuals are as large as their sd says; None where too few are left to say."""
     checked = math.isfinite(fit.excess)
     fits = False if causes else fit.excess >= FALSE_ALARM if checked else None
@@ -138,7 +140,7 @@ def _rests(accel: Accelerometer) -> list[dict[str, Any]]:
     ]
 
 
-def side_of(up: Array) -> str:
+def side_up(up: Array) -> str:
     """The side that is up in words: `+x`, `-y -z`."""
     return " ".join(f"{'+' if up[k] > 0 else '-'}{AXES[k]}" for k in range(3) if abs(up[k]) > 0.4 * np.abs(up).max())
 
@@ -157,7 +159,7 @@ def _positions(accel: Accelerometer) -> list[str]:
     sides = [np.array(up) / np.linalg.norm(up) for up in FLATS + EDGES + OPPOSITE]
     for _ in range(4):
         best, gained = None, 0.0
-        weak = np.diag(covariance)[own] > IDENTIFIED * np.diag(fit.prior)[own]
+        weak = np.diag(covariance)[own] > VARIANCE_LEFT_MOST * np.diag(fit.prior)[own]
         for up in sides:
             reading = inverse @ (up * place.gravity) + fit.theta[accelerometer.BIAS]
             row = up @ accelerometer.forces(fit.theta, reading[None], np.zeros(1))[1][0]
@@ -169,10 +171,10 @@ def _positions(accel: Accelerometer) -> list[str]:
                 best, gained, update = up, share, (row, moved)
         if best is None:
             break
-        named.append(f"{side_of(best)} up")
+        named.append(f"{side_up(best)} up")
         row, moved = update
         covariance -= np.outer(moved, moved) / (float(row @ moved) + noise)
-        if (np.diag(covariance)[own] <= IDENTIFIED * np.diag(fit.prior)[own]).all():
+        if (np.diag(covariance)[own] <= VARIANCE_LEFT_MOST * np.diag(fit.prior)[own]).all():
             break
     return named
 

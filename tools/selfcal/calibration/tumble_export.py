@@ -17,10 +17,10 @@ import numpy as np
 import yaml
 from scipy.linalg import rq
 
+from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError, remark
 from selfcal.base.grid import Array
 from selfcal.base.output import write_text
-from selfcal.base.templates import of_code
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer, matrix_of
@@ -38,7 +38,7 @@ class Whole:
     lines: tuple[str, ...]
 
 
-def write(
+def write_calibration(
     form: str, path: Path | str, accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]
 ) -> None:
     """Write a file in one of FORMS. Raises UserError where the bias or scale of an axis is not identified."""

@@ -20,17 +20,17 @@ Problem = Callable[[Array], tuple[Array, Array, Array]]
 
 #: Most iterations, and most halvings of a step. A step below 0.3 posterior sd is taken as it is. The last step is below
 #: 1e-4 posterior sd.
-ITERATIONS, HALVINGS = 50, 8
+ITERATIONS_MOST, HALVINGS = 50, 8
 UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in the units of their headings?"
 NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not of a sensor"
 #: Largest share of its prior variance that the data leave an identified parameter, and the factor by which priors are
 #: wider then.
-IDENTIFIED: float = _library32.TUMBLE_LEFT
+VARIANCE_LEFT_MOST: float = _library32.TUMBLE_LEFT
 WIDER: float = _library32.TUMBLE_WIDER
 
 
 @dataclass(frozen=True)
-class Fit:
+class TumbleFit:
     """Parameters `theta` [n] with their covariance [n, n], and the `prior` covariance [n, n] that they are held by.
     `white` [m] are the residuals and `columns` [m, n] their derivatives, both in units of their noise; `root` [m, m]
     scales them: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares. `step`
@@ -75,7 +75,7 @@ class Fit:
     @property
     def identified(self) -> Mask:
         """Whether the data alone leave a small share of each prior variance [n]."""
-        return np.asarray(np.diag(self.widened()) <= IDENTIFIED * np.diag(self.prior))
+        return np.asarray(np.diag(self.widened()) <= VARIANCE_LEFT_MOST * np.diag(self.prior))
 
     @property
     def free(self) -> float:
@@ -110,8 +110,8 @@ class Fit:
         return [(said, min(1.0, p)) for p, _, said in sorted(ranked) if p < FALSE_ALARM]
 
 
-def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
-    """The problem at parameters, as `fit` has it. Raises UserError."""
+def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: Mask | None = None) -> TumbleFit:
+    """The problem at parameters, as `fit_tumble` has it. Raises UserError."""
     free = np.ones(theta.size, bool) if held is None else ~held
     block = np.ix_(free, free)
     unit = np.sqrt(np.diag(prior))[free]
@@ -132,15 +132,17 @@ def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: 
     pull = own.T @ white + inverse @ apart
     moved = -covariance @ pull
     step[free] = moved * unit
-    return Fit(theta, whole, prior, white, columns, root, float(apart @ inverse @ apart), step, float(-moved @ pull))
+    return TumbleFit(
+        theta, whole, prior, white, columns, root, float(apart @ inverse @ apart), step, float(-moved @ pull)
+    )
 
 
-def fit(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
+def fit_tumble(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None) -> TumbleFit:
     """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
     stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
     Raises UserError where none settles."""
     current = linearized(problem, start if held is None else np.where(held, mean, start), mean, prior, held)
-    for _ in range(ITERATIONS):
+    for _ in range(ITERATIONS_MOST):
         step, sd = current.step, np.sqrt(np.diag(current.covariance))
         far = float(np.max(np.abs(step[sd > 0.0]) / sd[sd > 0.0]))
         following = linearized(problem, current.theta + step, mean, prior, held)

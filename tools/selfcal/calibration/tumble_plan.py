@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.bank.result import HALF_90
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
@@ -24,7 +24,7 @@ from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import Noise, of_model
-from selfcal.calibration.rests import ACCEL, CUT_S, GYRO, PIECES, REST_S, UNITS, Rest, Tumble
+from selfcal.calibration.tumble_rests import ACCEL, CUT_S, GYRO, REST_LEAST_S, REST_PIECES, UNITS, Rest, Tumble
 from selfcal.model.file import Model
 
 SCHEMA = "selfcal.plan_tumble/1"
@@ -36,10 +36,10 @@ OPPOSITE = tuple((-x, -y, -z) for x, y, z in EDGES)
 CORNERS = ((1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1))
 POSITIONS = {len(up): up for up in (FLATS, FLATS + EDGES, FLATS + EDGES + OPPOSITE + CORNERS)}
 #: Lengths of a rest that are tried, s, and the time of a turn between two rests, s.
-LENGTHS_S, TURN_S = (REST_S, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
+LENGTHS_S, TURN_S = (REST_LEAST_S, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
 #: sd of each of two angles by which a hand places the part off, rad; number of placements that are drawn; share of
 #: them that have what is planned.
-PLACED, DRAWN, SHARE = math.radians(3.0), 10, 0.9
+PLACED, PLACINGS, PLAN_SHARE = math.radians(3.0), 10, 0.9
 #: Quantities of a wish: the sensor, the unit here, and the places of the sensor's parameters.
 WISHES = {
     "accelerometer bias": ("accelerometer", "m/s^2", accelerometer.BIAS),
@@ -52,7 +52,7 @@ _WISH = re.compile(r"\s*(\S.*?)\s+within\s+([0-9.]+(?:e-?\d+)?)\s*(\S+)\s*", re.
 
 
 @dataclass(frozen=True)
-class Wish:
+class TumbleWish:
     """Half of the 90 % interval of every parameter of a group `name` is at most `most`, in SI units."""
 
     text: str
@@ -60,7 +60,7 @@ class Wish:
     most: float
 
     @staticmethod
-    def of(text: str) -> Wish:
+    def of(text: str) -> TumbleWish:
         """A wish as `scale within 100 ppm`. Raises UserError."""
         match = _WISH.fullmatch(text)
         known = ", ".join(WISHES)
@@ -74,17 +74,17 @@ class Wish:
                 raise UserError(f"--want '{text}': a scale is in ppm or %")
             size = float(match[2]) * sizes[unit]
         elif units.known(unit) and units.same_kind(unit, own):
-            size = units.convert(float(match[2]), unit, own)
+            size = units.converted(float(match[2]), unit, own)
         else:
             raise UserError(f"--want '{text}': {match[1]} is in {own}, which {unit} cannot be converted to")
         if not size > 0.0:
             raise UserError(f"--want '{text}': the size must be above 0")
-        return Wish(text, match[1], size)
+        return TumbleWish(text, match[1], size)
 
 
 def reached(model: Model, count: int, length_s: float) -> dict[str, float]:
-    """Half of the widest 90 % interval of each group in WISHES, SI units, that SHARE of the placements have at most;
-    infinite where one is not identified."""
+    """Half of the widest 90 % interval of each group in WISHES, SI units, that PLAN_SHARE of the placements have at
+    most; infinite where one is not identified."""
     noise = {}
     for name in ACCEL + GYRO:
         group = model.group_of(name)
@@ -93,8 +93,9 @@ def reached(model: Model, count: int, length_s: float) -> dict[str, float]:
         # A drift that is not known: from the top of three decades to their middle.
         noise[name] = replace(own.scaled(np.full(len(own.terms), 0.014)), wide=False)
     random = np.random.default_rng(count)
-    placements = [_of_placement(noise, _placed(random, POSITIONS[count]), length_s) for _ in range(DRAWN)]
-    return {name: sorted(placement[name] for placement in placements)[math.ceil(SHARE * DRAWN) - 1] for name in WISHES}
+    placements = [_of_placement(noise, _placed(random, POSITIONS[count]), length_s) for _ in range(PLACINGS)]
+    rank = math.ceil(PLAN_SHARE * PLACINGS) - 1
+    return {name: sorted(placement[name] for placement in placements)[rank] for name in WISHES}
 
 
 def _placed(random: np.random.Generator, positions: Sequence[tuple[int, int, int]]) -> Array:
@@ -112,7 +113,7 @@ def _of_placement(noise: dict[str, Noise], readings: Array, length_s: float) -> 
     begin = (length_s + TURN_S) * np.arange(len(readings)) + 0.5 * CUT_S
     none, seconds = np.zeros(6), length_s - CUT_S
     rests = tuple(
-        Rest(0, (a, a + seconds), a, a + seconds, seconds, f, none[:3], math.nan, none, np.zeros((PIECES, 6)))
+        Rest(0, (a, a + seconds), a, a + seconds, seconds, f, none[:3], math.nan, none, np.zeros((REST_PIECES, 6)))
         for a, f in zip(begin, readings, strict=True)
     )
     accel = accelerometer.calibrate(Tumble(rests, (), noise), Place(STANDARD_GRAVITY, 0.0, 0.0, 0.0, 0.0, ""))
@@ -128,7 +129,7 @@ def _of_placement(noise: dict[str, Noise], readings: Array, length_s: float) -> 
 
 def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
     """The document: by count of rests the shortest of LENGTHS_S that meets all wishes, None for none of them."""
-    wishes = [Wish.of(text) for text in texts]
+    wishes = [TumbleWish.of(text) for text in texts]
     rows = []
     for count in POSITIONS:
         for length_s in LENGTHS_S:
@@ -161,7 +162,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     console = console_of(to_stderr=to_stderr)
     line = partial(print_line, console)
     line("; ".join(document["wishes"]))
-    line(f"{SHARE:.0%} of placements by hand, off by {document['placed_deg']:g} deg (sd), reach it with:")
+    line(f"{PLAN_SHARE:.0%} of placements by hand, off by {document['placed_deg']:g} deg (sd), reach it with:")
     met = [row for row in document["rows"] if row["rest_s"] is not None]
     for row in document["rows"]:
         lost = f"; not identified: {', '.join(row['not_identified'])}" if row["not_identified"] else ""

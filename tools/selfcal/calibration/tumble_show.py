@@ -1,20 +1,17 @@
-"""What `selfcal tumble` prints and draws."""
+"""What `selfcal tumble` prints."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from selfcal.bank.result import HALF_90
-from selfcal.base.errors import printable
-from selfcal.base.output import console_of, plotter, print_line, save_picture, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.base.units import STANDARD_GRAVITY
-from selfcal.calibration.tumble_document import side_of
+from selfcal.calibration.tumble_document import side_up
 
 #: Data sheets' terms by group of parameters: word, unit, factor, and the number that is subtracted before.
 SHEET = {
@@ -36,7 +33,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     line = partial(print_line, console)
     turns = [turn for turn in document["turns"] if turn["left_out"] is None]
     line(f"{len(document['rests'])} rests, {len(turns)} turns")
-    line(f"up, rest by rest: {', '.join(side_of(np.array(rest['up'])) for rest in document['rests'])}")
+    line(f"up, rest by rest: {', '.join(side_up(np.array(rest['up'])) for rest in document['rests'])}")
     gravity = document["gravity"]
     line(f"gravity {gravity['value']:.6g} m/s^2 ({gravity['source']}); scales take its error, which no rest shows")
     for sensor in ("accelerometer", "gyroscope"):
@@ -81,23 +78,3 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             line(f"  {entry['cause']} (by chance {entry['p']:.1g})")
     for text in document["notes"]:
         line(f"note: {text}")
-
-
-def plot(document: Mapping[str, Any], path: Path | str) -> None:
-    """Save the residuals of |f| by rest, with the sd of each."""
-    figure, axes = plotter().subplots(figsize=(8.0, 4.2), layout="constrained")
-    rests = document["rests"]
-    micro = 1e6 / STANDARD_GRAVITY
-    places = np.arange(len(rests))
-    residual, sd = (micro * np.array([rest[key] for rest in rests]) for key in ("residual", "sd"))
-    axes.axhline(0.0, color="0.6", linewidth=0.8)
-    axes.errorbar(places, residual, HALF_90 * sd, fmt="o", markersize=4, capsize=3, linewidth=1)
-    axes.set_xticks(places, [side_of(np.array(rest["up"])) for rest in rests], rotation=60, fontsize=8)
-    axes.set_xlabel("side that is up, rest by rest")
-    axes.set_ylabel("|f| - g, ug")
-    axes.set_title(
-        f"{printable(Path(document['recordings'][0]['path']).name)}: residuals, bars hold 90 % of the noise",
-        fontsize=10,
-        parse_math=False,
-    )
-    save_picture(figure, path, 150)

@@ -8,18 +8,18 @@ import numpy as np
 from scipy.fft import rfft
 
 from selfcal.bank.blocks import MOST_DENSE
-from selfcal.likelihood.statemodel import Array
+from selfcal.base.grid import Array
 from selfcal.logs.recording import Recording, bridged
 
 #: Bins of the spectrum on each side that hold a line, at least; and those beside them that give the noise below it.
-HALF, BESIDE = 4, 40
+HALF, BINS_BESIDE = 4, 40
 #: Share of its frequency by which a line wanders along a record: its power is looked for within that.
 WANDERS = 0.02
 #: Power of a line over the scatter of the noise below it, at least.
-LEAST = 10.0
+LINE_POWER_LEAST = 10.0
 
 
-def of_readings(
+def alias_of(
     recording: Recording, axis: str, frequency_hz: float, half_width_hz: float, rate_hz: float
 ) -> tuple[float, float] | None:
     """Frequency, Hz, and amplitude, in the recording's unit, of the line of an axis that makes one of `frequency_hz` in
@@ -41,7 +41,7 @@ def of_readings(
         for hz in {k * rate_hz + frequency_hz, abs(k * rate_hz - frequency_hz)}:
             more, noise, centre = _line(power, hz / bin_hz, max(HALF, math.ceil(half_width_hz / bin_hz)))
             left = math.sin(math.pi * hz / rate_hz) * rate_hz / (recorded_hz * math.sin(math.pi * hz / recorded_hz))
-            if more > LEAST * noise and more * left**2 > best:
+            if more > LINE_POWER_LEAST * noise and more * left**2 > best:
                 best, place = more * left**2, centre
     if best == 0.0:
         return None
@@ -55,7 +55,7 @@ def _line(power: Array, place: float, half: int) -> tuple[float, float, float]:
     low, high = round(place) - half, round(place) + half + 1
     if low < 1 or high >= power.size:
         return 0.0, 0.0, place
-    beside = np.concatenate([power[max(1, low - BESIDE) : low], power[high : high + BESIDE]])
+    beside = np.concatenate([power[max(1, low - BINS_BESIDE) : low], power[high : high + BINS_BESIDE]])
     noise = float(np.median(beside)) / math.log(2.0)
     return (
         float((power[low:high] - noise).sum()),

@@ -9,9 +9,9 @@ import numpy as np
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis.suspicion import rough
-from selfcal.likelihood.joint import Joint, bins_of, fitted, last
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.joint import Joint, bins_of, fit_joint, last
 from selfcal.logs.recording import Recording
 from selfcal.model.file import HiddenInput, Model
 
@@ -41,5 +41,5 @@ def beside(y: Array, dt: float, loading: Array, rate: float) -> Joint:
     """The model of records y [m, n] of means `dt` s long, with a quantity of that `loading` [m] and `rate` a mean: the
     axes' own drifts and white noise are fitted beside it."""
     bins = bins_of(y)
-    alone = fitted(bins, dt, f=False)
-    return fitted(bins, dt, f=True, start=replace(alone, loading=loading, rate=rate), held=True)
+    alone = fit_joint(bins, dt, f=False)
+    return fit_joint(bins, dt, f=True, start=replace(alone, loading=loading, rate=rate), held=True)

@@ -19,13 +19,13 @@ from scipy.special import logsumexp
 from selfcal.bank.library import Bank
 from selfcal.bank.priors import state_own
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Extension
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import regressor_key
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.heldout import HeldOut, score_entry, spread
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.heldout import HeldOut, score_entry, sd_of_mean
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import Model, Regressor
 from selfcal.model.regressors import columns_of, mask_of, offered
@@ -33,13 +33,13 @@ from selfcal.model.tables import make_tables
 from selfcal.readings.readings import Readings, look
 
 #: Pieces of the second recording whose scatter gives the uncertainty.
-PIECES = 12
+SECOND_PIECES = 12
 #: Bank samples of the second recording at least: the bank reports on five and more, and each piece has as many.
-LEAST = 5 * PIECES
+SECOND_LEAST = 5 * SECOND_PIECES
 
 
 @dataclass(frozen=True)
-class Term:
+class BankTerm:
     """One finding as a part of the bank's model: columns with their coefficients, or a change of the model file's tree.
     `anew`: the sizes of its columns are weighed anew."""
 
@@ -58,12 +58,7 @@ def gains(
 
 
 def _of_axis(
-    model: Model,
-    tree: Mapping[str, Any],
-    record: Record,
-    found: Mapping[str, Diagnosed],
-    name: str,
-    second: Recording,
+    model: Model, tree: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed], name: str, second: Recording
 ) -> tuple[list[HeldOut], HeldOut]:
     findings = found[name].by_gain
     if name not in second.columns:
@@ -73,7 +68,7 @@ def _of_axis(
         regressor.name: regressor for regressor in Model.of_tree(tree, model.path).regressors
     }
     terms = [why_stays(finding) or term_of(found[name], finding, extended) for finding in findings]
-    carried = [term for term in terms if isinstance(term, Term)]
+    carried = [term for term in terms if isinstance(term, BankTerm)]
     if not carried:
         return [HeldOut(None, str(term)) for term in terms], HeldOut(None, "no finding is in the bank's model")
     try:
@@ -83,7 +78,7 @@ def _of_axis(
         none = HeldOut(None, str(error))
         return [HeldOut(None, term) if isinstance(term, str) else none for term in terms], none
 
-    def gained(others: Sequence[Term]) -> HeldOut:
+    def gained(others: Sequence[BankTerm]) -> HeldOut:
         """By all terms over the `others`."""
         try:
             return HeldOut(_compared(_evidence(model, record, found, name, readings, others), whole))
@@ -105,7 +100,7 @@ def why_stays(finding: Finding) -> str:
     return cause.score.no_carry(finding.look) or cause.score.once
 
 
-def term_of(axis: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> Term | str:
+def term_of(axis: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> BankTerm | str:
     """The finding as a part of the bank's model, or why it is none. `extended`: the model file's regressors."""
     cause = CAUSES[finding.look.cause]
     added = finding.columns
@@ -119,9 +114,9 @@ def term_of(axis: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]
         if not all(column.name in at for column in added):
             return "the final model does not have it"
         c = tuple(float(axis.state.best.c[1 + at[column.name]]) for column in added)
-        return Term(finding, tuple(extended[key] for key in keys), c, cause.score.anew)
+        return BankTerm(finding, tuple(extended[key] for key in keys), c, cause.score.anew)
     if cause.written.extend is not None and not cause.score.no_gain:
-        return Term(finding, (), (), False)
+        return BankTerm(finding, (), (), False)
     return cause.score.no_gain or "the bank's model does not change by it"
 
 
@@ -131,9 +126,9 @@ def _evidence(
     found: Mapping[str, Diagnosed],
     name: str,
     readings: Readings,
-    terms: Sequence[Term],
+    terms: Sequence[BankTerm],
 ) -> Array:
-    """Bank samples and ln evidence [2, PIECES] after each piece of the second recording, with `terms` in the model."""
+    """Bank samples and ln evidence [2, SECOND_PIECES] after each piece of the second recording, with `terms`."""
     own = with_terms(model, record, found, name, terms, [column for t in terms if t.anew for column in t.columns])
     regressors = offered(own, name)
     recording = readings.recording
@@ -146,9 +141,9 @@ def _evidence(
     bank = Bank(tables)
     prior = {hypothesis.name: hypothesis.ln_probability for hypothesis in tables.hypotheses}
     rows, columns = as_float(values)[:, None], as_float(columns_of(regressors, recording))
-    if values.size < LEAST:
-        raise UserError(f"the second recording is too short: {values.size} bank samples, and {LEAST} are needed")
-    cuts = np.linspace(0, values.size, PIECES + 1).astype(int)
+    if values.size < SECOND_LEAST:
+        raise UserError(f"the second recording is too short: {values.size} bank samples, and {SECOND_LEAST} are needed")
+    cuts = np.linspace(0, values.size, SECOND_PIECES + 1).astype(int)
     after = []
     for first, last in pairwise(cuts):
         piece = slice(first, last)
@@ -166,7 +161,7 @@ def with_terms(
     record: Record,
     found: Mapping[str, Diagnosed],
     name: str,
-    terms: Sequence[Term],
+    terms: Sequence[BankTerm],
     columns: Iterable[Regressor],
 ) -> Model:
     """The model with the laws of the terms of an axis, and these columns."""
@@ -189,4 +184,4 @@ def _compared(without: Array, whole: Array) -> dict[str, Any]:
         raise UserError("the bank takes other samples with the finding than without")
     n = whole[0]
     steps = np.diff(whole[1] - without[1]) / np.maximum(np.diff(n), 1.0)
-    return score_entry(float(without[1, -1] / n[-1]), float(whole[1, -1] / n[-1]), spread(steps), n[-1])
+    return score_entry(float(without[1, -1] / n[-1]), float(whole[1, -1] / n[-1]), sd_of_mean(steps), n[-1])

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.model_tree import digits
-from selfcal.likelihood.statemodel import Array
 
 if TYPE_CHECKING:
     from selfcal._reference import Random
     from selfcal.diagnosis.finding import Diagnosed, Finding
     from selfcal.diagnosis.record import Record
-    from selfcal.likelihood.state import Look, Regressor, State
+    from selfcal.likelihood.state import FittedColumn, Look, State
     from selfcal.model.file import Model
 
 #: Looks at one axis: the candidates of one cause or of several.
@@ -50,7 +50,7 @@ class Key:
     limits: str = "finite"
 
 
-def counted(default: Callable[[Setting], float] | None, field: str = "") -> Key:
+def count_key(default: Callable[[Setting], float] | None, field: str = "") -> Key:
     """A key whose value counts something."""
     return Key(default, field, is_count, "a whole number of at least 1")
 
@@ -154,7 +154,7 @@ class Written:
     law: Callable[[dict[str, Any], Look], None] | None = None
     extend: Callable[[Extension], None] | None = None
     stated: Callable[[Finding, Model], bool] = field(default=lambda finding, model: False)
-    of_column: Callable[[Regressor, Sequence[float]], dict[str, Any]] | None = None
+    of_column: Callable[[FittedColumn, Sequence[float]], dict[str, Any]] | None = None
 
 
 @dataclass(frozen=True)

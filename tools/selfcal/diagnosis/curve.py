@@ -13,19 +13,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import SMALLER, Shape, Tried
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.fit import left as left_of
-from selfcal.likelihood.state import ABREAST, NET_LEAST, Look, Regressor, State, net
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import ABREAST, NET_LEAST, FittedColumn, Look, State, net
 
 #: Knots of the splines, even over the channel's range.
 KNOTS = (6, 12, 36)
 #: Places of a hinge or a jump, even over the range; numbers of all their columns at most; terms of a curve at most.
-PLACES, NUMBERS_MOST, TERMS_MOST = 300, 20_000_000, 40
+HINGE_PLACES, NUMBERS_MOST, TERMS_MOST = 300, 20_000_000, 40
 #: Half the width of a jump, of the distance between places.
 JUMP = 0.05
 #: The form's name in the model file.
@@ -61,7 +61,7 @@ def best(state: State, found: Tried, means: Array) -> Tried:
 
 def _chosen(state: State, found: Tried, means: Array) -> Tried | None:
     """The curve of hinges and jumps."""
-    count = min(PLACES, NUMBERS_MOST // (2 * means.size))
+    count = min(HINGE_PLACES, NUMBERS_MOST // (2 * means.size))
     if count < KNOTS[0]:
         return None
     places = np.linspace(means.min(), means.max(), count + 1)[:-1]
@@ -114,7 +114,7 @@ def _picked(state: State, fit: Fit, terms: Array) -> list[int]:
 def _as_one(
     state: State,
     found: Tried,
-    column: Regressor,
+    column: FittedColumn,
     means: Array,
     places: Sequence[float] | Array,
     heights: Sequence[float] | Array,
@@ -148,7 +148,7 @@ def trained(look: Look, before: State, after: State, record: Record, split: int)
     return after.refit(regressors=(*(regressor for regressor in after.regressors if regressor is not own), *heights))
 
 
-def shape(column: Regressor, means: Array, price: float, unit: str, stated: dict[str, object]) -> Shape:
+def shape(column: FittedColumn, means: Array, price: float, unit: str, stated: dict[str, object]) -> Shape:
     """The spline through the knots of a column with its heights free."""
     rows = spline(means, column.entry["knots"])
     return Shape(FREE, rows, (column,), tuple(("coefficient", unit) for _ in rows), price, len(rows), stated=stated)

@@ -13,20 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.adequacy.document import Identified, parameters_entry, recording_entry, regressors_entry
 from selfcal.adequacy.identify import identify_axis
-from selfcal.base.ending import Held, Stopped, abandon
+from selfcal.adequacy.identify_document import Identified, parameters_entry, recording_entry, regressors_entry
+from selfcal.base.ending import HeldSignals, Stopped, abandon
 from selfcal.base.errors import UserError, note
+from selfcal.base.grid import Array
 from selfcal.base.progress import Doing
 from selfcal.diagnosis import hidden, module
+from selfcal.diagnosis.axis_verdict import of_checks
 from selfcal.diagnosis.causes import CAUSES
-from selfcal.diagnosis.document import to_document
+from selfcal.diagnosis.diagnose_document import diagnose_document
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
-from selfcal.diagnosis.record import Record, carried
-from selfcal.diagnosis.verdict import of_checks
+from selfcal.diagnosis.record import Record, is_counter
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 
@@ -36,7 +36,7 @@ OF_COUNTER = "its readings are increments of a counter, coarse against their noi
 #: The first look is at means at this rate, Hz. A recording of fewer samples, or slower than LEAST_HZ, needs none.
 FIRST_HZ, FIRST_FROM, LEAST_HZ = 1.0, 20_000, 4.0
 #: How long the work of an axis may go on after a signal, s: it ends at its next pass of the filter.
-PATIENCE_S = 0.3
+ENDS_WITHIN_S = 0.3
 
 
 def add_carried(
@@ -63,7 +63,7 @@ def add_carried(
 def looked_at(
     record: Record,
     names: Sequence[str],
-    ending: Held,
+    ending: HeldSignals,
     doing: Doing,
     means: Mapping[str, Diagnosed] = MappingProxyType({}),
 ) -> dict[str, Diagnosed]:
@@ -83,7 +83,7 @@ def looked_at(
         while not future.done() and not ending.asked:
             wait([future], timeout=0.1)
             doing.tick()
-        wait([future], timeout=PATIENCE_S if ending.asked else None)
+        wait([future], timeout=ENDS_WITHIN_S if ending.asked else None)
         if future.done():
             with suppress(Stopped):
                 future.result()
@@ -108,10 +108,7 @@ def entry_of(
     """The finding of all axes for the document."""
     units = {name: recording.columns[name].unit for name in shared.names}
     record = next(axis.record for axis in found.values() if axis.hidden is shared)
-    states = {
-        **record.axes,
-        **{name: axis.state for name, axis in found.items() if axis.hidden is shared},
-    }
+    states = {**record.axes, **{name: axis.state for name, axis in found.items() if axis.hidden is shared}}
     return hidden.entry(shared, states, units, record.start_s, stated=model.hidden_input is not None)
 
 
@@ -147,10 +144,10 @@ def by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Mod
                 diagnosed.findings.append(Finding(look, ROUNDS + 1, diagnosed.state, diagnosed.state))
 
 
-def show_first(recording: Recording, first: Mapping[str, Diagnosed], names: Sequence[str], ending: Held) -> None:
+def show_first(recording: Recording, first: Mapping[str, Diagnosed], names: Sequence[str], ending: HeldSignals) -> None:
     """The findings of the first look on stderr, as soon as they are there, and the axes `names` that it did not end."""
     with work.within(work.Work(lambda: True)):  # in words: nothing is measured for them
-        axes = to_document(recording, first, {}, {})["axes"]
+        axes = diagnose_document(recording, first, {}, {})["axes"]
     told = [f"{name}: {finding['cause']}: {finding['words']}" for name in axes for finding in axes[name]["findings"]]
     reasons = {name: first[name].unfinished if name in first else INTERRUPTED * ending.asked for name in names}
     told += [f"{name}: not finished: {reason}" for name, reason in reasons.items() if reason]
@@ -165,7 +162,7 @@ def why_not(record: Record, name: str) -> str:
         return record.left_out[name]
     if not below_lattice(record, name):
         return INTERRUPTED
-    return OF_COUNTER if carried(record, name) else BELOW_LATTICE
+    return OF_COUNTER if is_counter(record, name) else BELOW_LATTICE
 
 
 def below_lattice(record: Record, name: str) -> bool:
@@ -174,7 +171,7 @@ def below_lattice(record: Record, name: str) -> bool:
 
 
 def add_posteriors(
-    document: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed], model: Model, ending: Held
+    document: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed], model: Model, ending: HeldSignals
 ) -> dict[str, Identified | None]:
     """What the extended model knows of each axis at rest, as `identify` tells it; None where the record bears no
     report, and after a signal. The document has its posterior. Readings of a loud while are left out: a bank has one

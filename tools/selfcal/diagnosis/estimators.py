@@ -17,10 +17,10 @@ from scipy.linalg import lstsq, qr, svd
 from scipy.optimize import least_squares
 from scipy.signal import fftconvolve, lfilter
 
-from selfcal.diagnosis.forms import LONGEST_LAG
+from selfcal.base.grid import Array
+from selfcal.diagnosis.channel_looks import LONGEST_LAG
 from selfcal.likelihood.fit import Fit, left
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array
 
 #: Orders of ARX and of a state model at most, and taps of the weighting function.
 ORDERS, TAPS = 4, (1, 2, 4, 8, 16, 32)
@@ -31,7 +31,7 @@ Tried = tuple[float, int, tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Estimate:
+class OrderEstimate:
     """The `order` that a method chose with the `evidence` of each, nats below the best (half BIC). `values`: by order
     the static gain, and the delay of slow changes, steps."""
 
@@ -49,11 +49,11 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Beside:
+class OtherMethod:
     """One method beside the answer: its `estimate`, and least and most [2] of gain and delay over records that the
     answer makes."""
 
-    estimate: Estimate
+    estimate: OrderEstimate
     least: Array
     most: Array
 
@@ -66,7 +66,7 @@ class Beside:
         return bool(gain), bool(delay)
 
 
-def arx(u: Array, y: Array) -> Estimate:
+def arx(u: Array, y: Array) -> OrderEstimate:
     """A(q) y = B(q) u + e by least squares. White noise that enters at the output pulls the poles towards 0."""
 
     def tried(order: int) -> Tried:
@@ -78,17 +78,17 @@ def arx(u: Array, y: Array) -> Estimate:
     return _likeliest({order: tried(order) for order in range(1, ORDERS + 1)}, y.size - ORDERS)
 
 
-def armax(u: Array, y: Array) -> Estimate:
+def armax(u: Array, y: Array) -> OrderEstimate:
     """A(q) y = B(q) u + C(q) e by prediction error."""
     return _prediction_error(u, y, noise_of_its_own=False)
 
 
-def box_jenkins(u: Array, y: Array) -> Estimate:
+def box_jenkins(u: Array, y: Array) -> OrderEstimate:
     """y = B(q) / F(q) u + C(q) / D(q) e by prediction error."""
     return _prediction_error(u, y, noise_of_its_own=True)
 
 
-def _prediction_error(u: Array, y: Array, *, noise_of_its_own: bool) -> Estimate:
+def _prediction_error(u: Array, y: Array, *, noise_of_its_own: bool) -> OrderEstimate:
     """The best coefficients of each order by the steps of Levenberg and Marquardt, from those of ARX on."""
 
     def tried(order: int) -> Tried:
@@ -129,7 +129,7 @@ def _prediction_error(u: Array, y: Array, *, noise_of_its_own: bool) -> Estimate
     return _likeliest({order: tried(order) for order in range(1, NOISE_ORDERS + 1)}, y.size)
 
 
-def instruments(u: Array, y: Array) -> Estimate:
+def instruments(u: Array, y: Array) -> OrderEstimate:
     """A(q) y = B(q) u by two-stage least squares. Readings of the input before and after those of the equation are the
     instruments: the noise of a reading is in none of them, and it biases nothing. Nor does noise at the output."""
 
@@ -146,7 +146,7 @@ def instruments(u: Array, y: Array) -> Estimate:
     return _likeliest({order: tried(order) for order in range(NOISE_ORDERS + 1)}, y.size)
 
 
-def correlation(u: Array, y: Array) -> Estimate:
+def correlation(u: Array, y: Array) -> OrderEstimate:
     """The weighting function by the equations of Wiener and Hopf. Its order is the number of taps."""
     most = max(taps for taps in TAPS if 4 * taps <= y.size)
 
@@ -157,7 +157,7 @@ def correlation(u: Array, y: Array) -> Estimate:
     return _likeliest({taps: tried(taps) for taps in TAPS if taps <= most}, y.size - most)
 
 
-def subspace(u: Array, y: Array) -> Estimate:
+def subspace(u: Array, y: Array) -> OrderEstimate:
     """A state model by PO-MOESP (Verhaegen, Automatica 30, 1994): past input and output are the instruments. Of several
     heights of the block matrices each order keeps the likeliest. A pole slower than a third of the record is none."""
     before = np.concatenate([[0.0], u[:-1]])
@@ -193,7 +193,7 @@ def subspace(u: Array, y: Array) -> Estimate:
 
 
 #: Methods by name.
-METHODS: Mapping[str, Callable[[Array, Array], Estimate]] = MappingProxyType(
+METHODS: Mapping[str, Callable[[Array, Array], OrderEstimate]] = MappingProxyType(
     {
         "arx": arx,
         "armax": armax,
@@ -207,9 +207,9 @@ METHODS: Mapping[str, Callable[[Array, Array], Estimate]] = MappingProxyType(
 AS_READ = ("instruments",)
 
 
-def beside(
+def methods_beside(
     state: State, fit: Fit, u: Array, read: Array, answers: Array, before: Array, steps: int
-) -> dict[str, Beside]:
+) -> dict[str, OtherMethod]:
     """What each method makes of an input [n], or of its readings `read` [n], and the record in means of `steps`
     samples, and what it would make of records that `answers` [draws, n] to that input, the likeliest first, and the
     fitted noise make. `before` [n]: what the input left from before the record; it is taken out."""
@@ -229,11 +229,11 @@ def beside(
         spread = np.array(
             [by_order[own.order] for by_order in each if own.order in by_order] or [(own.gain, own.delay)]
         )
-        found[name] = Beside(own, spread.min(axis=0), spread.max(axis=0))
+        found[name] = OtherMethod(own, spread.min(axis=0), spread.max(axis=0))
     return found
 
 
-def _likeliest(tried: Mapping[int, Tried], n: int) -> Estimate:
+def _likeliest(tried: Mapping[int, Tried], n: int) -> OrderEstimate:
     """The order of the least half BIC."""
     score = {
         order: -0.5 * n * math.log(max(rss, 1e-300)) - 0.5 * free * math.log(n)
@@ -242,7 +242,7 @@ def _likeliest(tried: Mapping[int, Tried], n: int) -> Estimate:
     }
     best = max(score, key=lambda order: score[order])
     evidence = {order: value - score[best] for order, value in score.items()}
-    return Estimate(best, evidence, {order: tried[order][2] for order in score})
+    return OrderEstimate(best, evidence, {order: tried[order][2] for order in score})
 
 
 def _delayed(values: Array, steps: Iterable[int]) -> Array:

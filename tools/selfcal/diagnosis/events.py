@@ -17,21 +17,21 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc, expit
 
-from selfcal.adequacy.document import Identified
-from selfcal.bank.result import HALF_90
+from selfcal.adequacy.identify_document import Identified
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base import units
+from selfcal.base.grid import Array
 from selfcal.diagnosis import hidden, words
-from selfcal.diagnosis.alias import of_readings
+from selfcal.diagnosis.alias import alias_of
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.causes.variance_change import ENDS
 from selfcal.diagnosis.finding import UNEXPLAINED, Diagnosed, Finding
 from selfcal.diagnosis.score import bias_ahead, numbers
 from selfcal.likelihood import work
 from selfcal.likelihood.heldout import HARM_SD, MATTERS, in_sd
-from selfcal.likelihood.state import State, interval, log_normal, mixture
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import State, log_normal, mixture, normal_entry
 from selfcal.logs.recording import Recording
-from selfcal.readings.motion import joined
+from selfcal.readings.moves import joined_intervals
 
 #: The numbers, and their names in a summary.
 SUMMARY = {"N": "arw", "K": "rrw", "B": "bias_instability"}
@@ -43,7 +43,7 @@ OF_ALL, DISAGREE = ("s", "Hz", "deg"), 1e-3
 
 
 @dataclass(frozen=True)
-class Member:
+class EventMember:
     """A finding of one axis, and its entry in the document. `factor` turns the axis' inner unit into the recording's.
     `plain`: the noise of the readings with what the finding left out, over that without."""
 
@@ -65,7 +65,7 @@ class Member:
         with work.within(work.Work(lambda: False)):  # two passes: an end that was asked for keeps the result
             return 0.0 if before is after else (bias_ahead(after) - bias_ahead(before)) * self.factor
 
-    def joins(self, other: Member) -> bool:
+    def joins(self, other: EventMember) -> bool:
         """Whether both are one event or source."""
         a, b = self.finding.look, other.finding.look
         events = (self.finding.event, other.finding.event)
@@ -82,7 +82,7 @@ class Event:
     """One event or source: its `members`, the strongest first. `entry`: of a hidden quantity, which its pieces join.
     `axes`: that it acts on, in the document's order."""
 
-    members: list[Member]
+    members: list[EventMember]
     entry: dict[str, Any] | None = None
     id: str = ""
     axes: list[str] = field(default_factory=list)
@@ -118,7 +118,7 @@ def add_findings(
     for name, diagnosed in found.items():
         factor = units.factor(diagnosed.state.unit, document["axes"][name]["unit"])
         for finding, entry in zip(diagnosed.by_gain, document["axes"][name]["findings"], strict=True):
-            members.append(Member(name, finding, entry, factor, _plain(diagnosed, finding, recording, factor)))
+            members.append(EventMember(name, finding, entry, factor, _plain(diagnosed, finding, recording, factor)))
     events = grouped(members, quantity)
     drifts = {name: axis.drift for name, axis in found.items()}
     for event in events:
@@ -152,7 +152,7 @@ def add_findings(
         axis["numbers"] = _before_and_after(diagnosed, drifts[name], of_axis, axis["unit"], known.get(name))
 
 
-def grouped(members: Sequence[Member], quantity: dict[str, Any] | None = None) -> list[Event]:
+def grouped(members: Sequence[EventMember], quantity: dict[str, Any] | None = None) -> list[Event]:
     """Events and sources: a finding joins the first that it is one with, the nearest in time; else it begins one."""
     events = [] if quantity is None else [Event([], quantity)]
     jumps = [] if quantity is None else [jump["time_s"] for jump in quantity["estimate"]["jumps"]]
@@ -180,7 +180,7 @@ def grouped(members: Sequence[Member], quantity: dict[str, Any] | None = None) -
     return events
 
 
-def _apart(event: Event, member: Member) -> float:
+def _apart(event: Event, member: EventMember) -> float:
     """Time between an event and a finding, s; 0 where they have none."""
     one, two = event.members[0].finding.look.when, member.finding.look.when
     return 0.0 if one is None or two is None else abs(one[0] - two[0])
@@ -321,7 +321,7 @@ def _entry(event: Event) -> dict[str, Any]:
     return {**found, "words": entry.get("words") or words.event(found)}
 
 
-def _worth(members: Sequence[Member]) -> float:
+def _worth(members: Sequence[EventMember]) -> float:
     """Nats net of the searches: of an event that was found on several axes together it is paid for once."""
     together = {member.finding.event: member.finding.look.net for member in members if member.finding.event}
     return sum(together.values()) + sum(member.finding.look.net for member in members if not member.finding.event)
@@ -335,14 +335,14 @@ def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[st
         line, rate_hz = entry["estimate"]["frequency_hz"], found[axis].record.rate_hz
         if rate_hz > 0.5 * recording.rate_hz:
             continue
-        seen = of_readings(recording, axis, line["median"], line["q95"] - line["median"], rate_hz)
+        seen = alias_of(recording, axis, line["median"], line["q95"] - line["median"], rate_hz)
         if seen is not None and abs(seen[0] / line["median"] - 1.0) > MATTERS:
             told.append(seen[0])
             unit = recording.columns[axis].unit
             on_axis["estimate"] = {"readings_amplitude": {"median": seen[1], "unit": unit}, **on_axis["estimate"]}
     if told:
         sd = 1.0 / recording.duration_s
-        entry["estimate"]["readings_hz"] = interval(float(np.median(told)), sd, "Hz")
+        entry["estimate"]["readings_hz"] = normal_entry(float(np.median(told)), sd, "Hz")
         entry["words"] = words.event(entry)
     return bool(told)
 
@@ -356,7 +356,7 @@ def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
             if values[0]["unit"] in OF_ALL:
                 found[key] = _of_all(values)
         elif key == "intervals":
-            found[key] = [list(each) for each in joined([tuple(each) for value in values for each in value])]
+            found[key] = [list(each) for each in joined_intervals([tuple(each) for value in values for each in value])]
         elif all(value == values[0] for value in values):
             found[key] = values[0]
     return found
@@ -388,7 +388,7 @@ def _on(event: Event, axis: str) -> dict[str, Any]:
     return {"estimate": sizes, "probability": float(expit(max(member.finding.look.net for member in own)))}
 
 
-def _sum_of_forms(own: Sequence[Member]) -> dict[str, Any]:
+def _sum_of_forms(own: Sequence[EventMember]) -> dict[str, Any]:
     """The coefficient of one channel on an axis that several findings share, each in a form of its own: what a slow
     change of the channel does is their sum, beside the model with all of them. Empty where one form has it all."""
     last = max(own, key=lambda member: member.finding.round)
@@ -416,7 +416,7 @@ def _confirmed(gains: Sequence[Mapping[str, Any] | None]) -> bool | None:
 
 
 def _before_and_after(
-    axis: Diagnosed, drift: tuple[State, State], members: Sequence[Member], unit: str, known: Identified | None
+    axis: Diagnosed, drift: tuple[State, State], members: Sequence[EventMember], unit: str, known: Identified | None
 ) -> dict[str, dict[str, Any]]:
     """N, K and B of an axis: without any finding, and with all, as the extended model has them where that is `known`.
     Both are then in its measure: an axis without findings has one number. `drift`: as `_changes` has it."""

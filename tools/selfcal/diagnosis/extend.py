@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from selfcal.adequacy.part import read_out, rounding, without
+from selfcal.adequacy.part import density_without, lattice_density, put_read_out
 from selfcal.bank.priors import state_own
 from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError, note, remark
@@ -20,21 +20,21 @@ from selfcal.base.output import write_text
 from selfcal.diagnosis.cause import Cause, Extension
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.causes.vibration import WIDTHS_S
+from selfcal.diagnosis.channel_looks import form_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.forms import form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.fit import finish
-from selfcal.likelihood.state import Regressor as Column
-from selfcal.model.file import LONGEST_TEXT, MOST_COLUMNS, MOST_STATED, SMALLEST, Model
+from selfcal.likelihood.fit import fit_at
+from selfcal.likelihood.state import FittedColumn as Column
+from selfcal.model.file import LONGEST_TEXT, MOST_BANK_COLUMNS, MOST_STATED, SMALLEST, Model
 from selfcal.model.forms import NUMBER, curved, formed
 from selfcal.model.laws import averaged
 from selfcal.model.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
-WIDE = 5.0
+WIDE_PRIOR = 5.0
 #: Why a module leaves a finding out.
-NO_ROOM = f"a bank has {MOST_COLUMNS} columns, and more evidence fills them: `diagnose` alone takes the others"
+NO_ROOM = f"a bank has {MOST_BANK_COLUMNS} columns, and more evidence fills them: `diagnose` alone takes the others"
 #: Begins each file that is written here.
 HEAD = "# Written by `selfcal diagnose`"
 
@@ -51,7 +51,7 @@ def extended(
     if sensor is not None:
         tree["sensor"]["name"] = remark(sensor)[:LONGEST_TEXT]
     readings = {name: record.readings[name] for name in found if name in record.readings}
-    said = read_out(tree, model, readings, stated=sensor is None) if readings else ""
+    said = put_read_out(tree, model, readings, stated=sensor is None) if readings else ""
     kept = _regressors(model, record, found)
     if kept:
         tree["regressors"] = [*(tree.get("regressors") or []), *kept]
@@ -69,7 +69,7 @@ def extended(
         "duration_s": float(record.present.size / record.rate_hz),
         "axes": {
             name: fitted_law(
-                axis, block, rounding(tree["groups"][model.group_of(name).name], tree["sensor"]["rate_hz"])
+                axis, block, lattice_density(tree["groups"][model.group_of(name).name], tree["sensor"]["rate_hz"])
             )
             for name, axis in found.items()
         },
@@ -117,7 +117,7 @@ def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[list[str], l
     of_bank, of_file = len(stated), len(stated | beyond)
     for _, name, finding, keys in sorted(offered, key=lambda axis: -axis[0]):
         more = {key: count for key, count in keys.items() if key not in kept}
-        fits = of_bank + sum(more.values()) <= MOST_COLUMNS
+        fits = of_bank + sum(more.values()) <= MOST_BANK_COLUMNS
         of_bank += fits * sum(more.values())
         if finding is not None and not fits and all(finding is not each for _, each in out):
             out.append((name, finding))
@@ -138,7 +138,7 @@ def _fundamental(axis: Diagnosed, harmonic: str) -> Finding | None:
     return min((each for each in axis.findings if "harmonics" in each.look.estimate), key=off, default=None)
 
 
-def left_out(model: Model, found: Mapping[str, Diagnosed]) -> list[tuple[str, Finding]]:
+def no_room(model: Model, found: Mapping[str, Diagnosed]) -> list[tuple[str, Finding]]:
     """Findings whose columns a bank has no room for, each with its axis. Those of most evidence have it."""
     return _fitting(model, found)[1]
 
@@ -164,7 +164,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             ):
                 smoothed.add(key)
             c, sd = float(axis.state.best.c[1 + k]), float(axis.state.best.sd[1 + k])
-            entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE * (abs(c) + 2.0 * sd), 3))
+            entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE_PRIOR * (abs(c) + 2.0 * sd), 3))
     for key in smoothed:
         _smooth(entries[key], key, found)
     return [entries[key] for key in kept]
@@ -213,14 +213,14 @@ def _with_values(axis: Diagnosed, name: str, width: float, entry: Mapping[str, A
         replace(column, values=values) if column.name == name else column for column in axis.state.regressors
     )
     fit = axis.state.best
-    return finish(replace(axis.state, regressors=columns).series, fit.terms, fit.theta).ln_likelihood
+    return fit_at(replace(axis.state, regressors=columns).series, fit.terms, fit.theta).ln_likelihood
 
 
 def fitted_law(axis: Diagnosed, block: int | None = None, rounded: float = 0.0) -> dict[str, Any]:
     """The fitted law in the words of `simulate`: the base drift, white noise at low frequency, the bias.
 
     The fit takes the drift for a point at each of its samples, which are means of `block` others (laws.averaged), by
-    default of the recording's. `rounded`: density that the read-out adds by itself (part.rounding).
+    default of the recording's. `rounded`: density that the read-out adds by itself (part.lattice_density).
     """
     block = max(1, round(axis.record.recorded_hz / axis.record.rate_hz)) if block is None else block
     fit = axis.state.best
@@ -232,7 +232,7 @@ def fitted_law(axis: Diagnosed, block: int | None = None, rounded: float = 0.0) 
         m = math.tanh(fit.value("color"))
         lag1 = m if fit.terms.color == "ar" else m / (1.0 + m * m)
         N *= math.sqrt((1.0 + lag1) / (1.0 - lag1))
-    N = without(N, rounded)
+    N = density_without(N, rounded)
     drift: dict[str, Any] = {"hypothesis": "constant"}
     lacking = 0.0
     if fit.terms.walk:
@@ -329,7 +329,7 @@ def _of_columns(axis: Diagnosed) -> Iterator[_Effect]:
 
 
 def check_not_by_hand(path: Path | str | None) -> None:
-    """Raise UserError for an older file that `as_text` has not made: its author wants to keep it."""
+    """Raise UserError for an older file that `model_text` has not made: its author wants to keep it."""
     if path is None or not Path(path).is_file() or Path(path).stat().st_size == 0:
         return
     with Path(path).open("rb") as file:
@@ -344,14 +344,14 @@ def write_extended(
     path: Path | str, tree: Mapping[str, Any], source: Path | str, said: str, out: Sequence[tuple[str, Finding]]
 ) -> None:
     """Write the file. `said`: of its read-out; `out`: findings that a module leaves out. Notes name both."""
-    write_text(path, as_text(tree, source, said))
+    write_text(path, model_text(tree, source, said))
     note(f"{path}: {said}")
     if out:
         causes = ", ".join(f"{name} {finding.look.cause} ({finding.look.gain:.1f} nats)" for name, finding in out)
         note(f"{path}: a module leaves out {causes}: {NO_ROOM}")
 
 
-def as_text(tree: Mapping[str, Any], source: Path | str, said: str) -> str:
+def model_text(tree: Mapping[str, Any], source: Path | str, said: str) -> str:
     """The file's text. `said`: of its read-out."""
     head = f"{HEAD} from {remark(Path(source).name)}: the model with what was found in it.\n# {remark(said)}\n"
     return head + str(yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True, width=110))

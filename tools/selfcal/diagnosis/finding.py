@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from selfcal.base.grid import Array, Mask
 from selfcal.diagnosis.hidden import Hidden
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.likelihood.heldout import HeldOut
-from selfcal.likelihood.state import Look, Regressor, State
-from selfcal.likelihood.statemodel import Array, Mask
+from selfcal.likelihood.state import FittedColumn, Look, State
 
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
@@ -59,7 +59,7 @@ class Finding:
         return replace(self, ends=(less, final))
 
     @property
-    def columns(self) -> tuple[Regressor, ...]:
+    def columns(self) -> tuple[FittedColumn, ...]:
         """The columns that it added to the model."""
         known = {regressor.name for regressor in self.before.regressors}
         return tuple(regressor for regressor in self.after.regressors if regressor.name not in known)

@@ -16,12 +16,12 @@ import numpy as np
 from scipy.special import expit
 
 from selfcal.base import units as unit_module
-from selfcal.base.grid import half_means, regridded
+from selfcal.base.grid import Array, half_means, regridded
 from selfcal.diagnosis.model_tree import digits
 from selfcal.likelihood.columns import LN_EITHER
 from selfcal.likelihood.edges import steady
 from selfcal.likelihood.fit import best
-from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES, error_entry, in_sd, score_entry, spread
+from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, SCORE_PIECES, error_entry, in_sd, score_entry, sd_of_mean
 from selfcal.likelihood.joint import (
     LEAST_AXES,
     LINE,
@@ -31,14 +31,13 @@ from selfcal.likelihood.joint import (
     ahead,
     bins_of,
     course,
-    fitted,
+    fit_joint,
     refitted,
     without_each,
     without_lines,
     without_pairs,
 )
-from selfcal.likelihood.state import EVIDENT, NET_LEAST, Regressor, State, interval, net
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import EVIDENT, NET_LEAST, FittedColumn, State, net, normal_entry
 
 #: Name of the quantity in the document.
 ID = "hidden_input"
@@ -52,7 +51,7 @@ class On:
     size: float
     sd: float
     probability: float
-    column: Regressor
+    column: FittedColumn
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class Hidden:
     @cached_property
     def null(self) -> Joint:
         """The model without the quantity."""
-        return fitted(self.bins, self.dt, False, self.model)
+        return fit_joint(self.bins, self.dt, False, self.model)
 
     def worth(self, *, stated: bool) -> tuple[float, float]:
         """Nats by the quantity with its jumps, and net of the search; by the jumps alone of one that is `stated`."""
@@ -83,8 +82,8 @@ class Hidden:
     def halves(self) -> tuple[tuple[Joint, Course], tuple[Joint, Course]]:
         """Models of the first half, without the quantity and with it, and their filters over all."""
         bins = bins_of(self.y[:, : self.y.shape[1] // 2])
-        null = fitted(bins, self.dt, False, self.null)
-        models = (null, fitted(bins, self.dt, True, null))
+        null = fit_joint(bins, self.dt, False, self.null)
+        models = (null, fit_joint(bins, self.dt, True, null))
         return (models[0], course(models[0], self.y)), (models[1], course(models[1], self.y))
 
     @property
@@ -143,7 +142,7 @@ class Hidden:
         size, sd = float(fit.c[-1]), float(fit.sd[-1])
         gain = fit.ln_likelihood - best(free).ln_likelihood
         # Before the record it acts on an axis as likely as not.
-        return On(size, sd, float(expit(gain - math.log1p(abs(size) / sd))), Regressor(ID, ID, column, "1", {}))
+        return On(size, sd, float(expit(gain - math.log1p(abs(size) / sd))), FittedColumn(ID, ID, column, "1", {}))
 
     def put(self, state: State) -> State:
         """The state with it, if it acts on that axis."""
@@ -159,14 +158,14 @@ class Hidden:
         if not self.jumps:
             return whole, whole
         column = regridded(self.jumped[1] / self.step, self.dt, state.y.size, state.dt)
-        return whole, whole.refit(regressors=(*whole.regressors, Regressor(ID, ID, column, "1", {})))
+        return whole, whole.refit(regressors=(*whole.regressors, FittedColumn(ID, ID, column, "1", {})))
 
     def beside(self, states: Mapping[str, State]) -> Hidden | None:
         """The quantity given the current models of its axes, or None."""
         y = np.array([half_means(steady(state), max(1, round(self.dt / state.dt)))[0] for state in states.values()])
         n = min(y.shape[1], self.y.shape[1])
         y = np.where(np.isfinite(self.y[:, :n]), y[:, :n] / self.scale[:, None], np.nan)
-        model = weighed(fitted(bins_of(y), self.dt, False), y, self.dt)
+        model = weighed(fit_joint(bins_of(y), self.dt, False), y, self.dt)
         return None if model is None else replace(self, model=model, y=y)
 
     def explains(self, source: str, others: Collection[str], upto_hz: float = 0.0) -> bool:
@@ -203,7 +202,7 @@ def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
     if m < LEAST_AXES:
         return None
     bins = bins_of(y)
-    model = fitted(bins, dt, True, null)
+    model = fit_joint(bins, dt, True, null)
     if net(model.value - null.value, m + 1, LN_EITHER) < NET_LEAST:
         return None
     # A drift that one axis has beside a walk and a Gauss-Markov process would be taken for the quantity.
@@ -221,7 +220,7 @@ def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, A
     axis, half = hidden.names.index(name), hidden.y.shape[1] // 2
     scores = np.array([course.scores()[half:, axis] for _, course in (before, after)])
     scores = scores[:, np.isfinite(scores).all(axis=0)]
-    sd = spread(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]))
+    sd = sd_of_mean(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], SCORE_PIECES)]))
     factor *= float(hidden.scale[axis])
     rmse: dict[str, dict[str, float]] = {}
     for horizon in HORIZONS_S:
@@ -250,7 +249,7 @@ def entry(
         factor = unit_module.factor(states[name].unit, units[name])
         known = held_out(hidden, name, units[name], factor)
         gains.append(known)
-        loading = interval(on.size * factor, on.sd * factor, units[name])
+        loading = normal_entry(on.size * factor, on.sd * factor, units[name])
         axes[name] = {
             "estimate": {"loading": loading, "share": hidden.share(name)},
             "probability": on.probability,
@@ -302,7 +301,7 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
     scores = [np.nansum(side.scores(), axis=1) for side in before_after]
     more = before_after[1].ln_likelihood - before_after[0].ln_likelihood
     n = float(np.isfinite(y).any(axis=0).sum())
-    sd = spread(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]))
+    sd = sd_of_mean(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], SCORE_PIECES)]))
     before = float(scores[0].mean())
     return score_entry(before, before + more / n, sd, n)
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.special import pdtrc
 
+from selfcal.base.grid import Mask
 from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.state import Look, State, interval
-from selfcal.likelihood.statemodel import Mask
+from selfcal.likelihood.state import Look, State, normal_entry
 from selfcal.readings.budget import SHARES
 from selfcal.readings.held import equal_by_chance
 
@@ -39,7 +39,7 @@ def missing(record: Record) -> tuple[dict[str, Look], Mask]:
             "missing_samples",
             float(gone),
             float(gone),
-            {"missing": interval(float(gone), 0.0, "samples")},
+            {"missing": normal_entry(float(gone), 0.0, "samples")},
             {},
             when=(float(min(times)), float(max(times))),
         )
@@ -76,9 +76,9 @@ def rate_changes(record: Record) -> list[Look]:
             change.nats,
             change.nats,
             {
-                "time_s": interval(change.time_s, 0.5 / min(change.before_hz, change.after_hz), "s"),
-                "before_hz": interval(change.before_hz, 0.0, "Hz"),
-                "after_hz": interval(change.after_hz, 0.0, "Hz"),
+                "time_s": normal_entry(change.time_s, 0.5 / min(change.before_hz, change.after_hz), "s"),
+                "before_hz": normal_entry(change.before_hz, 0.0, "Hz"),
+                "after_hz": normal_entry(change.after_hz, 0.0, "Hz"),
             },
             {},
             when=(change.time_s, change.time_s),
@@ -94,15 +94,15 @@ def of_readings(record: Record, axis: str) -> Iterator[Look]:
         return
     n, time_s = readings.values.size, readings.recording.time_s
     if (changed := readings.misread) is not None:  # by a map of the firmware or the logger
-        fraction = interval(changed.share, math.sqrt(changed.share / n), "1")
+        fraction = normal_entry(changed.share, math.sqrt(changed.share / n), "1")
         estimate = {"kind": changed.kind, "fraction": fraction, "undone": changed.undone is not None}
         yield Look("misread", changed.nats, changed.nats, estimate, {})
     if readings.held is not None:  # the logger asks oftener than the part measures, always or in stretches
-        nats, rate_hz = min(1e6, readings.held.nats), interval(readings.recording.rate_hz, 0.0, "Hz")
+        nats, rate_hz = min(1e6, readings.held.nats), normal_entry(readings.recording.rate_hz, 0.0, "Hz")
         yield Look("held_samples", nats, nats, {"rate_hz": rate_hz}, {})
     elif readings.slower:
         surest = max(readings.slower, key=lambda stretch: stretch.nats)
-        rate_hz = interval(readings.recording.rate_hz / surest.ratio, 0.0, "Hz")
+        rate_hz = normal_entry(readings.recording.rate_hz / surest.ratio, 0.0, "Hz")
         nats = min(1e6, sum(stretch.nats for stretch in readings.slower))
         yield _of_stretches("held_samples", nats, readings.slower_intervals, rate_hz=rate_hz)
     if readings.intervals:
@@ -112,8 +112,8 @@ def of_readings(record: Record, axis: str) -> Iterator[Look]:
         times = time_s[mask if mask.any() else readings.values == common.value]
         when = (float(times[0]), float(times[-1]))
         lost: dict[str, Any] = {
-            "fraction": interval(share, math.sqrt(share / mask.size), "1"),
-            "time_s": interval(when[0], 0.0, "s"),
+            "fraction": normal_entry(share, math.sqrt(share / mask.size), "1"),
+            "time_s": normal_entry(when[0], 0.0, "s"),
             "undone": bool(mask.any()),
         }
         yield Look("outliers", common.nats, common.nats, lost, {}, when=when)
@@ -136,7 +136,7 @@ def saturation(record: Record, axis: str) -> tuple[Look, State] | None:
         return None
     clipped = readings.clipped
     sd = readings.lattice.step / 4.0 if readings.lattice is not None else 1e-6 * abs(clipped.limit)
-    estimate = {"limit": interval(clipped.limit, sd, state.unit), "clipped": int(clipped.mask.sum())}
+    estimate = {"limit": normal_entry(clipped.limit, sd, state.unit), "clipped": int(clipped.mask.sum())}
     return _anew(record, axis, Look("saturation", clipped.nats, clipped.nats, estimate, {}))
 
 
@@ -147,11 +147,11 @@ def quantization(record: Record, axis: str) -> tuple[Look, State] | None:
     found = None if readings is None or readings.clipped is not None else readings.uneven
     if readings is not None and found is not None and not state.below_lattice:
         step = 0.0 if readings.lattice is None else readings.lattice.step
-        lsb = {"lsb": interval(step, step * 1e-3, state.unit)} if step > 0.0 else {}
-        estimate: dict[str, Any] = {**lsb, "misread": interval(found.share, found.sd, "1")}
+        lsb = {"lsb": normal_entry(step, step * 1e-3, state.unit)} if step > 0.0 else {}
+        estimate: dict[str, Any] = {**lsb, "misread": normal_entry(found.share, found.sd, "1")}
         if found.value is not None and found.width is not None:
-            estimate["value"] = interval(found.value, 0.0, state.unit)
-            estimate["width"] = interval(found.width, 0.0, state.unit)
+            estimate["value"] = normal_entry(found.value, 0.0, state.unit)
+            estimate["width"] = normal_entry(found.width, 0.0, state.unit)
         changes = {"stated_lsb": step} if lsb else {}
         return _anew(record, axis, Look("quantization", found.nats, found.nats, estimate, changes))
     q, stated = state.lsb, state.stated_lsb
@@ -163,7 +163,7 @@ def quantization(record: Record, axis: str) -> tuple[Look, State] | None:
         return None
     # Continuous readings would fall within 1/1000 of a lattice by chance: ln 1000 nats each.
     gain = state.best.n * math.log(max(q / white, 1.0) * 10.0)
-    look = Look("quantization", gain, gain, {"lsb": interval(q, q * 1e-3, state.unit)}, {"stated_lsb": q})
+    look = Look("quantization", gain, gain, {"lsb": normal_entry(q, q * 1e-3, state.unit)}, {"stated_lsb": q})
     return look, replace(state, stated_lsb=q)
 
 

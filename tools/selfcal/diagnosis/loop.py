@@ -15,18 +15,18 @@ import numpy as np
 from selfcal.base.ending import Stopped
 from selfcal.base.grid import regridded, runs
 from selfcal.diagnosis import hidden, integrity, module, score
+from selfcal.diagnosis.axis_verdict import unexplained
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, tilt, variance_change
+from selfcal.diagnosis.channel_looks import side_looks
 from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding, rarer
-from selfcal.diagnosis.forms import side_looks
-from selfcal.diagnosis.record import TIMES, Record, carried
+from selfcal.diagnosis.record import TIMES, Record, is_counter
 from selfcal.diagnosis.statistics import judged
-from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import edges, work
 from selfcal.likelihood.heldout import HeldOut, harmful, in_sd
-from selfcal.likelihood.state import ALIKE, NET_LEAST, SLOW_S, Look, Regressor, State
-from selfcal.readings.motion import Moved
+from selfcal.likelihood.state import ALIKE, NET_LEAST, SLOW_S, FittedColumn, Look, State
+from selfcal.readings.moves import Moved
 
 #: Looks that one round tries on an axis.
 LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)
@@ -44,7 +44,7 @@ HOLDS = 2
 #: Noise of a fit over that of the first one, below which it has none: of readings that are equal it explains them all.
 NO_NOISE = 1e-6
 #: Number of the first loud stretch of several axes, beyond those of events and lines.
-FIRST_LOUD = 1 + module.MOST + module.FAST_LINES
+FIRST_LOUD = 1 + module.EVENTS_MOST + module.FAST_LINES
 #: From this finding on, a cause waits that was worth less than another one when it was last looked at.
 BUSY = 3
 
@@ -74,7 +74,7 @@ def diagnose_record(
     left_out = {
         name
         for name, state in states.items()
-        if state.below_lattice and (state.redrawn or state.lattice_is_stated or carried(record, name))
+        if state.below_lattice and (state.redrawn or state.lattice_is_stated or is_counter(record, name))
     }
     states = {name: state for name, state in states.items() if name not in left_out}
     record = replace(record, axes=states)
@@ -159,7 +159,7 @@ def _weed(found: Mapping[str, Diagnosed]) -> None:
         ]
         most = [gain > 0.5 * finding.look.gain for gain, (_, finding) in zip(gains, parts, strict=True)]
         kept = [gain for gain, own in zip(gains, most, strict=True) if own]
-        least = NET_LEAST if len(kept) == 1 < len(parts) else module.NAMED
+        least = NET_LEAST if len(kept) == 1 < len(parts) else module.NAMED_NATS
         stays = sum(kept) - price >= least
         for (axis, finding), state, own in zip(parts, less, most, strict=True):
             if stays and own:
@@ -285,7 +285,7 @@ def _give(
     record: Record,
     found: Mapping[str, Diagnosed],
     states: dict[str, State],
-    event: module.Event,
+    event: module.JointEvent,
     number: int,
     span: float,
 ) -> bool:
@@ -295,7 +295,7 @@ def _give(
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
     # An axis whose model has the column already has no look.
     looks = {name: look for name, look in looks.items() if look.shape is None or look.shape.regressors}
-    if sum(look.gain for look in looks.values()) < module.NAMED:  # what the axes know by now explains it
+    if sum(look.gain for look in looks.values()) < module.NAMED_NATS:  # what the axes know by now explains it
         return False
     findings = {}
     for name, look in looks.items():
@@ -325,7 +325,7 @@ def _between(state: State, passing: Sequence[tuple[int, int]], span: float) -> S
 def _fast(record: Record, found: Mapping[str, Diagnosed]) -> Record:
     """What acts on several axes faster than means show."""
     states = dict(record.axes)
-    for number, line in enumerate(module.fast_lines(states), 1 + module.MOST):
+    for number, line in enumerate(module.fast_lines(states), 1 + module.EVENTS_MOST):
         _give(record, found, states, line, number, SLOW_S)
     return _with(record, found, states)
 
@@ -357,7 +357,7 @@ def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str
     return _with(record, found, dict(zip(record.axes, work.each(taken_over, record.axes), strict=True)))
 
 
-def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
+def _stretched(column: FittedColumn, means: Record, state: State) -> FittedColumn:
     """A column of means on the grid of a state. The edges of an event are moved to where the samples have them."""
     n, span = state.y.size, 1.0 / means.rate_hz
     times = {key: float(column.entry[key]) for key in TIMES if key in column.entry}
@@ -368,7 +368,7 @@ def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
     return replace(column, values=edges.raised(n, *places), entry=entry)
 
 
-def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], state: State) -> Finding:
+def _sharper(finding: Finding, means: Record, columns: Sequence[FittedColumn], state: State) -> Finding:
     """A finding of means with the times of its jumps that the samples show, where none is left out about them."""
     finding = replace(finding, record=means, round=0)
     of_name = {column.name: column.entry for column in columns}
@@ -427,11 +427,7 @@ def _refuted(look: Look, held_out: HeldOut | None) -> bool:
 
 
 def _looked(
-    axis: Diagnosed,
-    record: Record,
-    causes: Sequence[Looks],
-    worth: dict[Looks, float],
-    seen: dict[Looks, list[Look]],
+    axis: Diagnosed, record: Record, causes: Sequence[Looks], worth: dict[Looks, float], seen: dict[Looks, list[Look]]
 ) -> list[Look]:
     """The looks of `causes`, the most worth first; what has no name comes after every cause that has one. `seen` are
     those at this state. A cause waits while its `worth`, when it was last looked at, is less than the best has now."""

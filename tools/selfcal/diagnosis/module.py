@@ -19,19 +19,19 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import logsumexp, softmax
 
-from selfcal.base.grid import half_means
+from selfcal.base.grid import Array, Mask, half_means
 from selfcal.diagnosis.alias import WANDERS
 from selfcal.diagnosis.causes.periodic import SLOW_TURNS, TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
-from selfcal.diagnosis.causes.variance_change import ln_changes, stretches
-from selfcal.diagnosis.forms import FORMS, LN_FORMS, shape_of, side_of, variants_of
+from selfcal.diagnosis.causes.variance_change import ln_changes, noisy_stretches
+from selfcal.diagnosis.channel_looks import FORMS, LN_FORMS, shape_of, side_of, variants_of
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
 from selfcal.likelihood.columns import FITTED, LN_EITHER, LN_SLOW
 from selfcal.likelihood.edges import EDGE, peaks, scan, white_of
 from selfcal.likelihood.joint import (
     CLEAR_LINE,
-    WIDTHS,
+    SIZE_WIDTHS,
     Act,
     Course,
     Joint,
@@ -40,20 +40,19 @@ from selfcal.likelihood.joint import (
     bins_of,
     bridged_rows,
     course,
-    fitted,
+    fit_joint,
     information,
     refitted,
     without_lines,
 )
 from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, SLOW_S, State
-from selfcal.likelihood.statemodel import Array, Mask
 
 #: False-alarm rate of the joint search at T nats, over e^-T: modules on which nothing acts (`make module-null`).
 NULL = 0.05
 #: Evidence of a candidate that is named, nats.
-NAMED = math.log(NULL) + EVIDENT
+NAMED_NATS = math.log(NULL) + EVIDENT
 #: Means that the joint model takes at least, and the share of them that an axis may lack.
-LEAST, GAPS = 600, 0.3
+JOINT_MEANS_LEAST, GAPS = 600, 0.3
 #: Evidence of an event that is beyond doubt, nats: before the quantity is weighed its wandering looks like events.
 CERTAIN = 25.0
 #: A mean so many deviations of the noise off the median of this many is left out: a spike is no event that lasts.
@@ -61,11 +60,11 @@ SPIKE, SPIKE_OF = 7.0, 5
 #: Means on either side of a jump that may be on neither level; the levels are those of twice as many farther off.
 PASSING = 6
 #: Events of a module at most, those of one axis among them.
-MOST = 16
+EVENTS_MOST = 16
 #: Places beside the best one that share its evidence.
-NEAR = 30
+PLACES_NEAR = 30
 #: Places of a search that are weighed over the sets of axes: the best ones of all axes, and of each.
-PLACES = 4
+WEIGHED = 4
 #: Lines above the means' band that are looked at.
 FAST_LINES = 6
 #: A line is fitted with the drifts so often at most, or until it moves by less than this many turns in the record.
@@ -75,15 +74,15 @@ MULTIPLES = 5
 #: Jumps of all levels, the largest ones, of which each two may be the ends of a pulse.
 PAIRED = 30
 #: Samples of a pulse at least.
-SHORTEST = 4
+PULSE_LEAST = 4
 #: Share of the information of a step far from the ends, from which on two of them are taken as there.
-WHOLE = 0.95
+WHOLE_INFORMATION = 0.95
 #: Durations of a pulse, a factor apart, and its places in one duration.
-LONGER, PLACES_IN = 1.15, 16
+DURATION_RATIO, PLACES_IN = 1.15, 16
 #: Bins about a frequency that tell its noise.
-BESIDE = 50
+BINS_OF_NOISE = 50
 #: A jump that one size of the quantity explains to this share is the quantity's own.
-PATTERN = 0.7
+OWN_SHARE_LEAST = 0.7
 #: Causes of those jumps.
 JUMPS = ("step", "pulse")
 #: Causes that the quantity may be, with that pattern: its course has any shape.
@@ -101,7 +100,7 @@ Shape = tuple[str, tuple[float, ...], Array, float]
 
 
 @dataclass(frozen=True)
-class Event:
+class JointEvent:
     """What the axes `names` have in common, of the shape `theta`, and what it is worth, nats. `passing`: from and
     before which means it passes from one level to the other."""
 
@@ -136,10 +135,10 @@ class Candidate:
         """[m, n]: what it adds to each axis."""
         return np.asarray(self.act.size.T @ self.columns)
 
-    def of(self, names: Sequence[str]) -> Event:
+    def of(self, names: Sequence[str]) -> JointEvent:
         """As an event of the axes `names` that have it."""
         held = tuple(names[k] for k in self.act.axes)
-        return Event(held, self.cause, self.theta, self.evidence, self.passing)
+        return JointEvent(held, self.cause, self.theta, self.evidence, self.passing)
 
     def share_of(self, loading: Array) -> float:
         """Share of its information that one size of a quantity with these loadings explains."""
@@ -152,7 +151,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenAxes:
     """The axes together: records `y` [m, n] of means `dt` s long in units of their noise, their joint `model`, and side
     `channels` [n]. `kept_out` [n // 2 + 1]: frequencies that are left to the axes."""
 
@@ -212,17 +211,17 @@ def sizes(score: Array, known: Array) -> Array:
 def _best(gain: Array, score: Array, known: Array, apart: int) -> list[int]:
     """The best places of scores [n, m]: of all axes together, by their `gain` [n], and of each alone."""
     alone = 0.5 * score**2 / np.maximum(np.diagonal(known, axis1=-2, axis2=-1), 1e-300)
-    found = [peaks(gain, PLACES, apart), *(peaks(row, 1, apart) for row in alone.T)]
+    found = [peaks(gain, WEIGHED, apart), *(peaks(row, 1, apart) for row in alone.T)]
     return list(dict.fromkeys(at for each in found for at in each))
 
 
 def _shared(gain: Array, at: int) -> float:
     """ln of the number of places about the best one that share its evidence, by their gains [n]."""
-    near = gain[max(0, at - NEAR) : at + NEAR + 1] - gain[at]
+    near = gain[max(0, at - PLACES_NEAR) : at + PLACES_NEAR + 1] - gain[at]
     return float(logsumexp(np.minimum(near, 0.0)))
 
 
-def steps(seen: Seen) -> Iterator[Candidate]:
+def steps(seen: SeenAxes) -> Iterator[Candidate]:
     """A jump of the levels at each sample."""
     score = np.where(seen.passed[:, None], 0.0, seen.course.shock)
     score[: seen.edge] = score[-seen.edge :] = 0.0
@@ -233,14 +232,14 @@ def steps(seen: Seen) -> Iterator[Candidate]:
         yield Candidate("step", (at * seen.dt,), found, math.log(seen.n) - _shared(gain, at), column[None])
 
 
-def pulses(seen: Seen) -> Iterator[Candidate]:
+def pulses(seen: SeenAxes) -> Iterator[Candidate]:
     """Two jumps of one size, there and back. A first search takes their information as it is far from the ends."""
-    count = max(1, int(math.log(seen.n / 3.0 / SHORTEST) / math.log(LONGER)))
-    lengths = np.unique((SHORTEST * LONGER ** np.arange(count)).astype(int))
+    count = max(1, int(math.log(seen.n / 3.0 / PULSE_LEAST) / math.log(DURATION_RATIO)))
+    lengths = np.unique((PULSE_LEAST * DURATION_RATIO ** np.arange(count)).astype(int))
     shock = seen.course.shock
-    octaves = math.log(seen.n / 3.0 / SHORTEST)
+    octaves = math.log(seen.n / 3.0 / PULSE_LEAST)
     every = np.diagonal(seen.course.known, axis1=1, axis2=2)
-    near_end = np.any(every < WHOLE * np.diag(seen.cross[0]), axis=1)
+    near_end = np.any(every < WHOLE_INFORMATION * np.diag(seen.cross[0]), axis=1)
     best: list[tuple[float, int, int]] = []
     for length in map(int, lengths):
         score = shock[:-length] - shock[length:]
@@ -259,8 +258,8 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
     cross = seen.cross[0] - seen.cross[last - first]
     gain = full(shock[first] - shock[last], cross + np.swapaxes(cross, 1, 2))
     paired = [*zip(gain.tolist(), first.tolist(), last.tolist(), strict=True)]
-    places = [_moved(seen, *pair[1:]) for each in (best, paired) for pair in sorted(each, reverse=True)[:PLACES]]
-    places = [place for place in dict.fromkeys(places) if place[1] - place[0] >= SHORTEST]
+    places = [_moved(seen, *pair[1:]) for each in (best, paired) for pair in sorted(each, reverse=True)[:WEIGHED]]
+    places = [place for place in dict.fromkeys(places) if place[1] - place[0] >= PULSE_LEAST]
     t = np.arange(seen.n)
     columns = np.array([(t >= begin) & (t < end) for begin, end, _ in places], dtype=np.float64).reshape(-1, seen.n)
     for (begin, end, alike), column, known in zip(
@@ -271,7 +270,7 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
         yield Candidate("pulse", (begin * seen.dt, end * seen.dt), found, price, column[None])
 
 
-def _moved(seen: Seen, begin: int, end: int) -> tuple[int, int, float]:
+def _moved(seen: SeenAxes, begin: int, end: int) -> tuple[int, int, float]:
     """Each place of a pulse in turn at its best within a fifth of its length, and ln of the number of pairs of places
     that share its evidence."""
     shock, alike = seen.course.shock, [0.0, 0.0]
@@ -281,7 +280,7 @@ def _moved(seen: Seen, begin: int, end: int) -> tuple[int, int, float]:
             at = begin if first else end
             low, high = max(seen.edge, at - reach), min(seen.n - seen.edge, at + reach + 1)
             places = np.arange(low, high)
-            places = places[places < end - SHORTEST] if first else places[places > begin + SHORTEST]
+            places = places[places < end - PULSE_LEAST] if first else places[places > begin + PULSE_LEAST]
             if not places.size:
                 continue
             other = end if first else begin
@@ -294,14 +293,14 @@ def _moved(seen: Seen, begin: int, end: int) -> tuple[int, int, float]:
     return begin, end, sum(alike)
 
 
-def lines(seen: Seen) -> Iterator[Candidate]:
+def lines(seen: SeenAxes) -> Iterator[Candidate]:
     """A sine of each frequency. Its noise is the weights' own about it: no model of drift knows the colour there."""
     n, weights = seen.n, seen.course.weights
     U = rfft(weights, axis=0)
     turn = 2.0 * math.pi * np.maximum(np.arange(U.shape[0]), 1) / n
     level = seen.model.precision(turn) * (2.0 - 2.0 * np.cos(turn))[:, None, None]
     ratio = np.abs(U) ** 2 / n / np.maximum(np.diagonal(level, axis1=1, axis2=2), 1e-300)
-    own = np.sqrt(_level(ratio, max(4, min(BESIDE, U.shape[0] // 8)), 0))
+    own = np.sqrt(_level(ratio, max(4, min(BINS_OF_NOISE, U.shape[0] // 8)), 0))
     known = 0.5 * n * level * own[:, :, None] * own[:, None, :]
     low = max(1, math.ceil(TURNS_LEAST))
     hz = np.arange(U.shape[0])
@@ -391,7 +390,7 @@ def _level(ratio: Array, beside: int, axis: int) -> Array:
     return np.maximum(found, 0.5)
 
 
-def fast_lines(states: Mapping[str, State]) -> list[Event]:
+def fast_lines(states: Mapping[str, State]) -> list[JointEvent]:
     """Lines of several axes above the band of means. They are looked for in the innovations of every sample, over the
     level of their neighbours. One that an axis shows beyond doubt is left to it."""
     names = [name for name, state in states.items() if not state.below_lattice]
@@ -406,7 +405,7 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
     inverse = np.linalg.inv(np.corrcoef(w))
     padded = 2 * next_fast_len(n, real=True)
     power = rfft(w, padded, axis=1).astype(np.complex64)
-    own = _level(np.abs(power) ** 2 / n, 2 * BESIDE, 1)
+    own = _level(np.abs(power) ** 2 / n, 2 * BINS_OF_NOISE, 1)
     power /= np.sqrt(own)
     gain = (power.conj() * (inverse.astype(np.float32) @ power)).sum(axis=0).real / n
     gain[(np.abs(power) ** 2).max(axis=0) > CLEAR_LINE * n] = 0.0
@@ -425,29 +424,29 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
         joint, price = max(((acts, price) for acts, price, _ in tried), key=lambda each: each[0].evidence - each[1])
         evidence = joint.evidence - price - float(ln_lines(np.array(turn * n), n, np.array(joint.evidence)))
         if evidence >= EVIDENT and len(joint.axes) > 1:
-            found.append(Event(tuple(names[k] for k in joint.axes), "periodic", (turn / dt,), evidence))
+            found.append(JointEvent(tuple(names[k] for k in joint.axes), "periodic", (turn / dt,), evidence))
         gain[max(0, at - 8) : at + 9] = 0.0
     return found
 
 
-def louder(states: Mapping[str, State]) -> Event | None:
+def louder(states: Mapping[str, State]) -> JointEvent | None:
     """The stretch in which the noise of several axes has another level; None: they show none. Beside it each axis has
     its own noise, so that its evidence is that of the axes apart."""
     names = [name for name, state in states.items() if not state.below_lattice]
     if len({(states[name].y.size, states[name].dt) for name in names}) != 1 or len(names) < 2:
         return None
     of, dt = [states[name] for name in names], states[names[0]].dt
-    found = list[Event]()
-    for power, (begin, end) in stretches(of):
+    found = list[JointEvent]()
+    for power, (begin, end) in noisy_stretches(of):
         level, n = (rows[:, :, 0] for rows in power.levels(begin, end))
         wide = power.wide(of, begin, end)
-        gain, widths = power.gain(begin, end) / wide[:, None], np.array(WIDTHS)
+        gain, widths = power.gain(begin, end) / wide[:, None], np.array(SIZE_WIDTHS)
         sd = np.sqrt(2.0 * wide * (1.0 / np.maximum(n, 1.0)).sum(axis=0))
         ln_bf = gain - gain / (1.0 + widths**2) - 0.5 * np.log1p(widths**2)
         acts = act_apart(ln_bf, np.log(level[0] / level[1]), sd)
         price = ln_changes(power.n, float(gain[acts.axes].sum()), 1 + (end < power.n))
         held = tuple(names[k] for k in acts.axes)
-        found.append(Event(held, "variance_change", (begin * dt, end * dt), acts.evidence - price))
+        found.append(JointEvent(held, "variance_change", (begin * dt, end * dt), acts.evidence - price))
     best = max(found, key=lambda event: event.evidence)
     return best if best.evidence >= EVIDENT and len(best.names) > 1 else None
 
@@ -495,7 +494,7 @@ def _of_columns(y: Array, model: Joint, weights: Array, multiples: Sequence[int]
     return gain
 
 
-def transients(seen: Seen) -> Iterator[Candidate]:
+def transients(seen: SeenAxes) -> Iterator[Candidate]:
     """A constant rate, and a bias that settles: theta is its time constant, s, and how far off that may be, in its
     logarithm."""
     t = (np.arange(seen.n) + 0.5) * seen.dt
@@ -517,7 +516,7 @@ def _simplest(found: Iterable[Candidate]) -> list[Candidate]:
     return [candidate for candidate in found if candidate.cause == "ramp" or candidate.evidence > ramp + ALIKE]
 
 
-def channels(seen: Seen) -> Iterator[Candidate]:
+def channels(seen: SeenAxes) -> Iterator[Candidate]:
     """Temperature and supply in their forms."""
     for cause, values in seen.channels.items():
         side = replace(side_of(cause, "", values), forms=CHANNEL_FORMS)
@@ -532,13 +531,13 @@ def channels(seen: Seen) -> Iterator[Candidate]:
         yield from _weighed(seen, shapes, _scored(seen, shapes))
 
 
-def _scored(seen: Seen, shapes: Sequence[Shape]) -> tuple[Array, Array, Array]:
+def _scored(seen: SeenAxes, shapes: Sequence[Shape]) -> tuple[Array, Array, Array]:
     """The columns [k, n], their scores [k, m], and the information of each [k, m, m]."""
     columns = np.array([shape[2] / max(float(np.std(shape[2])), 1e-300) for shape in shapes])
     return columns, columns @ seen.course.weights, information(seen.model, seen.y, columns)
 
 
-def _weighed(seen: Seen, shapes: Sequence[Shape], scored: tuple[Array, Array, Array]) -> Iterator[Candidate]:
+def _weighed(seen: SeenAxes, shapes: Sequence[Shape], scored: tuple[Array, Array, Array]) -> Iterator[Candidate]:
     """Slow columns. The best ones are weighed over the drifts of each axis that its record leaves possible: a law
     alone is too sure of what a drift does over the whole record. Beside a quantity, which the axes have in common, the
     drifts are fitted anew."""
@@ -563,14 +562,14 @@ def _alone(row: bytes, dt: float) -> State:
     return State("", "", y, dt, 0.0, np.ones(y.size)).refit()
 
 
-def apart(seen: Seen, candidate: Candidate) -> Candidate:
+def apart(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """A slow candidate over the drifts of each axis that its record leaves possible."""
     states = [_alone(row.tobytes(), seen.dt) for row in seen.y]
-    each = [state.bayes(candidate.columns[0], np.array(WIDTHS)) for state in states]
+    each = [state.bayes(candidate.columns[0], np.array(SIZE_WIDTHS)) for state in states]
     return replace(candidate, act=act_apart(*map(np.array, zip(*each, strict=True))), more=0.0)
 
 
-def beside(seen: Seen, candidate: Candidate) -> Candidate:
+def beside(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """The candidate with the drifts fitted anew beside its column, which it may have on any axis."""
     known = information(seen.model, seen.y, candidate.columns[:1])[0]
     effect = sizes(candidate.columns @ seen.course.weights, known).T @ candidate.columns
@@ -580,14 +579,14 @@ def beside(seen: Seen, candidate: Candidate) -> Candidate:
     return _gained(seen, replace(candidate, act=act(score, known)), score, model, found)
 
 
-def _gained(seen: Seen, candidate: Candidate, score: Array, model: Joint, found: Course) -> Candidate:
+def _gained(seen: SeenAxes, candidate: Candidate, score: Array, model: Joint, found: Course) -> Candidate:
     """The candidate, of scores [p, m] at a new `model`, with what the records less its effect gain there. `found`: the
     records at that model, which may suit them better without it too."""
     gain = course(model, seen.y - candidate.effect).ln_likelihood - max(seen.course.ln_likelihood, found.ln_likelihood)
     return replace(candidate, more=gain - 0.5 * float((candidate.act.size * score).sum()))
 
 
-def locked(seen: Seen, candidate: Candidate) -> Candidate:
+def locked(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """A line with the drifts fitted anew beside it, at the frequency that it has there: drifts that were fitted without
     have swallowed the most of a slow one, and what they left lies elsewhere."""
     n, multiples = seen.n, (1, *map(round, candidate.theta[1:]))
@@ -606,7 +605,7 @@ def locked(seen: Seen, candidate: Candidate) -> Candidate:
     return candidate
 
 
-def settled(seen: Seen, candidate: Candidate) -> Candidate:
+def settled(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """A bias that settles with the drifts fitted anew beside it, by the time constants that it may have there: ever
     closer ones, until the record no longer tells them apart."""
     t, (tau, step) = (np.arange(seen.n) + 0.5) * seen.dt + seen.since_s, candidate.theta
@@ -631,7 +630,7 @@ def settled(seen: Seen, candidate: Candidate) -> Candidate:
     return candidate if seen.model.has_f else apart(seen, candidate)
 
 
-def between_levels(seen: Seen, candidate: Candidate) -> Candidate:
+def between_levels(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """A jump less the means in which it passes from one level to the other, with the drifts fitted anew: the one that a
     jump widens takes a half for the whole."""
     passing = []
@@ -660,7 +659,7 @@ def between_levels(seen: Seen, candidate: Candidate) -> Candidate:
 #: Causes whose shape is looked for once more with the drifts beside them: their family, and that look.
 FIRMED = {"periodic": ("line", locked), "turn_on": ("transient", settled)}
 #: The searches; a jump's has the name of its cause.
-FAMILIES: dict[str, Callable[[Seen], Iterator[Candidate]]] = {
+FAMILIES: dict[str, Callable[[SeenAxes], Iterator[Candidate]]] = {
     "step": steps,
     "pulse": pulses,
     "line": lines,
@@ -693,8 +692,8 @@ class Search:
     single: list[Candidate] = field(default_factory=list)
 
     @cached_property
-    def seen(self) -> Seen:
-        return Seen(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s)
+    def seen(self) -> SeenAxes:
+        return SeenAxes(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s)
 
     @cached_property
     def known(self) -> dict[str, list[Candidate]]:
@@ -711,7 +710,7 @@ class Search:
         one's own."""
         vain: list[Candidate] = []
         firm: list[Candidate] = []
-        turns = MOST - len(self.several) - len(self.single)
+        turns = EVENTS_MOST - len(self.several) - len(self.single)
         while turns > 0:
             left = {
                 name: [candidate for candidate in each if not any(candidate is other for other in vain)]
@@ -756,7 +755,7 @@ class Search:
 
     def _is_own(self, candidate: Candidate) -> bool:
         """Whether it has the pattern of the quantity in the model, in time and over the axes."""
-        if candidate.share_of(self.model.loading) <= PATTERN:
+        if candidate.share_of(self.model.loading) <= OWN_SHARE_LEAST:
             return False
         if candidate.cause not in self.channels:
             return candidate.cause in OF_TIME
@@ -766,7 +765,7 @@ class Search:
     def weigh(self, model: Joint) -> None:
         """Take a model with the quantity. What goes like it over the axes is its own, or a channel that is looked for
         again beside it: its wandering may go like a channel for a while."""
-        alike = [candidate for candidate in self.several if candidate.share_of(model.loading) > PATTERN]
+        alike = [candidate for candidate in self.several if candidate.share_of(model.loading) > OWN_SHARE_LEAST]
         self.rest = self.rest + sum(candidate.effect for candidate in alike)
         self.several = [candidate for candidate in self.several if not any(candidate is each for each in alike)]
         self.model = refitted(model, self.rest, self.dt) if alike else model
@@ -778,7 +777,7 @@ def together(
     channels: Mapping[str, Array],
     since_s: float = 0.0,
     apart: Mapping[str, Mask] = MappingProxyType({}),
-) -> Module | None:
+) -> JointModule | None:
     """What acts on several axes of one grid; None: there are too few axes or means to tell.
 
     `channels` [n]: temperature and supply. `apart` [n]: as a record has it. Before the quantity is
@@ -789,24 +788,24 @@ def together(
     rest = calmed({name: state for name, state in states.items() if not state.below_lattice}, apart)
     found = {name: half_means(values, block)[0] for name, values in rest.items()}
     found = {name: y for name, y in found.items() if np.isfinite(y).mean() > 1.0 - GAPS}
-    if len(found) < 2 or min(y.size for y in found.values()) < LEAST:
+    if len(found) < 2 or min(y.size for y in found.values()) < JOINT_MEANS_LEAST:
         return None
     y, kept_out, scale = in_means(np.array(list(found.values())))
     span = block * dt
     side = {cause: half_means(values, block)[0] for cause, values in channels.items()}
-    null = fitted(bins_of(y), span, False)
+    null = fit_joint(bins_of(y), span, False)
     search = Search(span, side, kept_out, since_s, null, y)
     search.go(CERTAIN)
     model = weighed(search.model, search.rest, span)
     if model is not None:
         search.weigh(model)
-    search.go(NAMED)
+    search.go(NAMED_NATS)
     of = None
     if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
         y = np.where(np.isfinite(search.rest), y, np.nan) - sum(candidate.effect for candidate in search.several)
         model = refitted(search.model, y, span)
         of = Hidden(tuple(found), model, y, scale, span).calm()
-    return Module(tuple(found), span, tuple(search.several), of, scale)
+    return JointModule(tuple(found), span, tuple(search.several), of, scale)
 
 
 def in_means(y: Array) -> tuple[Array, Mask, Array]:
@@ -820,7 +819,7 @@ def in_means(y: Array) -> tuple[Array, Mask, Array]:
 
 
 @dataclass(frozen=True)
-class Module:
+class JointModule:
     """What acts on several of the axes `names`: `events`, of means `dt` s long, and one quantity that nobody recorded
     or None. `scale` [m]: units of the search."""
 

@@ -12,30 +12,20 @@ from scipy.ndimage import uniform_filter1d
 from selfcal import _library32
 from selfcal.bank.blocks import MOST_DENSE
 from selfcal.base.errors import UserError
-from selfcal.base.grid import Rows
-from selfcal.likelihood.state import Regressor, State
-from selfcal.likelihood.statemodel import Array, Mask
+from selfcal.base.grid import Array, Mask, Rows
+from selfcal.likelihood.state import FittedColumn, State
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
-from selfcal.logs.sampling import Change
+from selfcal.logs.sampling import RateChange
 from selfcal.logs.timebase import Clock
 from selfcal.model.file import REGRESSORS, Group, Model
 from selfcal.model.file import Regressor as Stated
 from selfcal.model.forms import variance_of
 from selfcal.model.regressors import columns_of, offered
 from selfcal.readings.held import Held
-from selfcal.readings.readings import (
-    Readings,
-    copied,
-    evened,
-    look,
-    mostly_beyond,
-    own_rows,
-    readings_of,
-    thinned,
-)
+from selfcal.readings.readings import Readings, copied, evened, look, mostly_beyond, own_rows, readings_of, thinned
 
 #: Samples that a diagnosis needs at least.
-LEAST = 200
+FEWEST = 200
 #: Largest reading over the sensor's range: beyond, the unit is wrong, or the file.
 BEYOND = 100.0
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
@@ -73,7 +63,7 @@ class Record:
     missing: Mapping[str, Missing] = field(default_factory=dict)
     recorded_hz: float = 1.0
     readings: Mapping[str, Readings] = field(default_factory=dict)
-    changes: tuple[Change, ...] = ()
+    changes: tuple[RateChange, ...] = ()
     redrawn: Mapping[str, Array] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     start_s: float = 0.0
@@ -174,8 +164,8 @@ def _grid_of(recording: Recording, decimate: float | None, axes: Sequence[str]) 
     base = min(clocks, key=lambda clock: clock.rate_hz, default=recording.clock)
     block = 1 if decimate is None else max(1, round(base.rate_hz / decimate))
     n = int(base.place[-1] - float(base.place[0]) + 1) // block
-    if n < LEAST:
-        raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {LEAST} or more")
+    if n < FEWEST:
+        raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {FEWEST} or more")
     if n > MOST_DENSE:
         raise UserError(
             f"{recording.path}: {n:,} samples at this rate with the gaps, more than {MOST_DENSE:,}: "
@@ -184,7 +174,7 @@ def _grid_of(recording: Recording, decimate: float | None, axes: Sequence[str]) 
     return _Grid(base, block, n)
 
 
-def of_recording(recording: Recording, model: Model, decimate: float | None = None, axes: Sequence[str] = ()) -> Record:
+def record_from(recording: Recording, model: Model, decimate: float | None = None, axes: Sequence[str] = ()) -> Record:
     """Every sensor column that the model knows, in the unit of each axis' group, and the side channels. What the model
     file states is in the model of each axis from the start. Stuck readings are left out. Where every axis holds its
     readings the record has the part's own rate; where some do, the repeats of those are left out.
@@ -281,8 +271,8 @@ def _axis_of(
         return found[there[np.maximum(0, np.searchsorted(there, np.arange(found.size), side="right") - 1)]]
 
     y, r = grid.means(clock, spread(readings.values if each == 1 else readings.drawn))
-    if (usable := int(np.isfinite(y).sum())) < LEAST:
-        return f"{usable} of its readings neither stick nor are clipped, a diagnosis needs {LEAST} or more"
+    if (usable := int(np.isfinite(y).sum())) < FEWEST:
+        return f"{usable} of its readings neither stick nor are clipped, a diagnosis needs {FEWEST} or more"
     moving = np.zeros(grid.n, bool)
     if readings.moving.any():
         # A mean of which one sample moved is left out: the next ones may ring on below what is loud.
@@ -317,9 +307,9 @@ def _axis_of(
     )
 
 
-def _stated(recording: Recording, model: Model, name: str, grid: _Grid) -> tuple[Regressor, ...]:
+def _stated(recording: Recording, model: Model, name: str, grid: _Grid) -> tuple[FittedColumn, ...]:
     """The model file's regressors of an axis."""
-    stated: list[Regressor] = []
+    stated: list[FittedColumn] = []
     own = recording.along(name) if offered(model, name) else recording
     for regressor in offered(model, name):
         values = columns_of((regressor,), own)
@@ -332,11 +322,11 @@ def _stated(recording: Recording, model: Model, name: str, grid: _Grid) -> tuple
             if regressor.kind == "periodic" and np.abs(row).max() < 0.01:
                 continue
             about = bridged(grid.means(own.clock, np.ascontiguousarray(row))[0]) - regressor.offset
-            stated.append(Regressor(column, _cause(regressor, model), about, regressor.unit, entry))
+            stated.append(FittedColumn(column, _cause(regressor, model), about, regressor.unit, entry))
     return tuple(stated)
 
 
-def carried(record: Record, name: str) -> bool:
+def is_counter(record: Record, name: str) -> bool:
     """Whether the readings are increments of a counter."""
     readings = record.readings.get(name)
     return readings is not None and readings.lattice is not None and readings.lattice.carried > 0.0

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 from selfcal.base import units
-from selfcal.base.errors import UserError, printable
-from selfcal.base.output import console_of, plotter, print_line, save_picture, table_of
+from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.diagnosis import transfer
-from selfcal.diagnosis.estimators import beside
+from selfcal.diagnosis.estimators import methods_beside
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.transfer import DRAWS, PROBABILITY, STRUCTURES, Drive, Empirical, Input, Posterior, Tried
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Regressor, State
-from selfcal.likelihood.statemodel import Array
+from selfcal.diagnosis.transfer import DRAWS, PROBABILITY, STRUCTURES, Draws, Drive, Empirical, Input, Trial
+from selfcal.likelihood.state import ALIKE, NET_LEAST, FittedColumn, State
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import POWER
 from selfcal.model.regressors import coefficient_unit
@@ -36,7 +35,7 @@ SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
 #: Records that the answer makes. Of 20 records the next one is within their range with 90 %.
 RECORDS = 20
 #: Rounds in which each of several inputs is searched beside the others.
-ROUNDS = 2
+INPUT_ROUNDS = 2
 #: Quantiles of an interval.
 ENDS = tuple(0.5 + end * PROBABILITY / 2.0 for end in (-1.0, 0.0, 1.0))
 #: How the readings of a held input were taken.
@@ -72,7 +71,7 @@ def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
         reason = reason if known else "is neither temp, nor supply, nor an axis of the model"
         raise UserError(f"{recording.path}: column '{name}' {reason}: choose another --input")
     unit = recording.columns[name].unit
-    values = units.convert(record.channel_of(name), dict(SIDE_CHANNELS.values())[name], unit)
+    values = units.converted(record.channel_of(name), dict(SIDE_CHANNELS.values())[name], unit)
     clock = recording.clock
     rows = updates(recording.columns[name].values, clock.place)
     read_at = clock.time_s if rows is None else clock.time_s[rows]
@@ -107,10 +106,10 @@ def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str,
 
     def beside_others(name: str, apart: Sequence[str] = ()) -> State:
         columns = [(other, column) for other, block in known.items() if other not in (name, *apart) for column in block]
-        added = [Regressor(f"{other}_{k}", "input", column, "1", {}) for k, (other, column) in enumerate(columns)]
+        added = [FittedColumn(f"{other}_{k}", "input", column, "1", {}) for k, (other, column) in enumerate(columns)]
         return state.refit(regressors=(*state.regressors, *added)) if added else state
 
-    for _ in range(ROUNDS if len(inputs) > 1 else 0):
+    for _ in range(INPUT_ROUNDS if len(inputs) > 1 else 0):
         for name in order:
             more[name], columns = _best(beside_others(name), inputs[name])
             known[name] = columns if more[name] > 0.0 else columns[:0]
@@ -146,7 +145,7 @@ def _best(state: State, inputs: Sequence[Input]) -> tuple[float, Array]:
     return best.score, best.columns
 
 
-def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Tried], Input]:
+def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Trial], Input]:
     """Every structure of the input as it acts likeliest, and that input."""
     each = [[transfer.tried(state, Drive(u.values, state.dt), structure) for structure in STRUCTURES] for u in inputs]
     # Of two that explain a record alike, the first is meant.
@@ -217,10 +216,10 @@ def answer_of(state: State, inputs: Sequence[Input], against: Sequence[str] = ()
 class Pooled:
     """Posteriors of the structures that a record leaves possible, the likeliest first, and the weight of each."""
 
-    each: Sequence[Posterior]
+    each: Sequence[Draws]
     weight: Array
 
-    def of(self, value: Callable[[Posterior], NDArray[Any]], key: str = "gain") -> NDArray[Any]:
+    def of(self, value: Callable[[Draws], NDArray[Any]], key: str = "gain") -> NDArray[Any]:
         """Draws of a value, from each structure that has the key by its weight."""
         chosen = [k for k, answer in enumerate(self.each) if key in answer.structure.keys]
         share = self.weight[chosen] / self.weight[chosen].sum()
@@ -301,7 +300,7 @@ def _estimate(pooled: Pooled, output: str, unit: str) -> dict[str, Any]:
     }
 
 
-def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Pooled, seen: Empirical) -> dict[str, Any]:
+def _methods(state: State, drive: Drive, read: Array, chosen: Trial, pooled: Pooled, seen: Empirical) -> dict[str, Any]:
     """Estimates of other methods beside an answer that is linear and has a static gain, and the step of their means."""
     if "gain" not in chosen.structure.keys or not chosen.structure.linear:
         return {}
@@ -312,7 +311,7 @@ def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Poo
     own = len(chosen.structure.keys)
     parts = chosen.fit.c[-len(chosen.columns) :, None] * chosen.columns
     answers = np.vstack([parts[:own].sum(axis=0), *pooled.answers(drive, RECORDS - 1)])
-    found = beside(state, chosen.fit, drive.u, read, answers, parts[own:].sum(axis=0), steps)
+    found = methods_beside(state, chosen.fit, drive.u, read, answers, parts[own:].sum(axis=0), steps)
     step_s = steps * state.dt
     clear = seen.coherence > seen.chance
     # Its own errors are in the answer's ratio too.
@@ -426,48 +425,3 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         line(f"ratio of spectra: {spectra['hold_answer']} of {spectra['bands']} coherent bands hold the answer")
     else:
         line("ratio of spectra: no band is coherent beyond chance")
-
-
-def plot_response(document: Mapping[str, Any], path: Path | str) -> None:
-    """Save gain, phase and coherence over frequency. Raises UserError if the file cannot be written."""
-    figure, (gain, phase, coherence) = plotter().subplots(
-        3, 1, figsize=(8.0, 8.6), sharex=True, layout="constrained", height_ratios=(3, 3, 2)
-    )
-    column, axis = document["input"], document["output"]
-    found = document["structure"] if "estimate" in document else "no structure"
-    found = found if document["influence"] else "no influence"
-    figure.suptitle(
-        f"{printable(Path(document['recording']['path']).name)}: {column['column']} -> {axis['axis']}, {found}\n"
-        f"source: {document['source']['verdict']}",
-        parse_math=False,
-    )
-    seen = {key: np.array(values) for key, values in document["empirical"].items()}
-    clear = seen["coherence"] > seen["coherence_by_chance"]
-    for panel, key in ((gain, "gain"), (phase, "phase_deg")):
-        for which, color, label in ((clear, "black", "ratio of spectra, 90 %"), (~clear, "0.75", "... by chance")):
-            error = [seen[key] - seen[f"{key}_q05"], seen[f"{key}_q95"] - seen[key]]
-            shown = [np.where(which, values, np.nan) for values in (seen[key], *error)]
-            panel.errorbar(
-                seen["frequency_hz"], shown[0], shown[1:], color=color, marker="o", markersize=3.5, linestyle="",
-                elinewidth=1, label=label,
-            )  # fmt: skip
-        if band := document.get("frequency_response"):
-            at = band["frequency_hz"]
-            panel.fill_between(at, band[f"{key}_q05"], band[f"{key}_q95"], color="tab:blue", alpha=0.3, linewidth=0)
-            panel.plot(at, band[key], color="tab:blue", label=f"{document['structure']}, 90 %")
-        panel.grid(True, alpha=0.3)
-    gain.set_xscale("log")
-    gain.set_yscale("log")
-    if clear.any():
-        gain.set_ylim(bottom=0.2 * float(seen["gain"][clear].min()))
-    gain.set_ylabel(f"gain, {units.typeset(coefficient_unit(axis['unit'], column['unit']))}")
-    gain.legend(fontsize="small", frameon=False)
-    phase.set_ylabel("phase, degrees")
-    coherence.plot(seen["frequency_hz"], seen["coherence"], color="black", marker="o", markersize=3.5)
-    coherence.plot(seen["frequency_hz"], seen["coherence_by_chance"], color="0.6", linestyle="--", label="by chance")
-    coherence.set_ylim(0.0, 1.02)
-    coherence.set_ylabel("coherence")
-    coherence.set_xlabel("frequency, Hz")
-    coherence.legend(fontsize="small", frameon=False)
-    coherence.grid(True, alpha=0.3)
-    save_picture(figure, path, dpi=110)

@@ -15,18 +15,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import gammaln, logsumexp, softmax
 
-from selfcal.base.grid import Rows
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.base.units import FLICKER_FLOOR
 from selfcal.diagnosis.causes import CAUSES
-from selfcal.diagnosis.extend import WIDE
+from selfcal.diagnosis.extend import WIDE_PRIOR
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import passed, run
-from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut, error_entry, score_entry, spread
+from selfcal.likelihood.heldout import HORIZONS_S, SCORE_PIECES, HeldOut, error_entry, score_entry, sd_of_mean
 from selfcal.likelihood.state import Look, Sequential, State
-from selfcal.likelihood.statemodel import Array, Mask, matrices
+from selfcal.likelihood.statemodel import matrices
 
 #: Samples to score, and between the first and the last prediction, at least.
-LEAST = 30
+SCORED_LEAST = 30
 #: The bias is a mean over so long, s.
 BIAS_S = 60.0
 
@@ -87,7 +87,7 @@ def gain(
         first = split + min(int(np.argmax(column[split:] != 0.0)) for column in added)
         piece = int(np.searchsorted(cut.edges, first, "right")) - 1
         later[piece] -= max(0.0, look.gain - look.net) / cut.sizes[piece]
-    return _held_out(cut, scores, later, spread(later - scores), before.unit, _errors(after, old, new, horizons))
+    return _held_out(cut, scores, later, sd_of_mean(later - scores), before.unit, _errors(after, old, new, horizons))
 
 
 def _held_out(
@@ -104,9 +104,9 @@ def _cut(before: State, after: State, split: int) -> Cut | None:
     n = before.y.size
     there = [np.isfinite(state.y) for state in (before, after)]
     kept = split + np.flatnonzero((there[0] & there[1])[split:])
-    if kept.size < LEAST:
+    if kept.size < SCORED_LEAST:
         return None
-    pieces = np.array_split(kept, PIECES)
+    pieces = np.array_split(kept, SCORE_PIECES)
     edges = np.array([split, *(piece[0] for piece in pieces[1:]), n])
     out = there[0] != there[1]
     changes = split + 1 + np.flatnonzero(np.diff(out[split:]))
@@ -117,7 +117,7 @@ def _horizons(dt: float, n: int, split: int) -> dict[float, Rows]:
     """By horizon the samples from which the bias is predicted, where there are enough."""
     places = np.unique(np.linspace(split, n - 1, 300).astype(np.int64))
     found = {horizon: places[places <= n - _ahead(horizon, dt) - _window(dt)] for horizon in HORIZONS_S}
-    return {horizon: each for horizon, each in found.items() if each.size and each[-1] - split >= LEAST}
+    return {horizon: each for horizon, each in found.items() if each.size and each[-1] - split >= SCORED_LEAST}
 
 
 def _ahead(horizon: float, dt: float) -> int:
@@ -138,7 +138,7 @@ def _added(before: State, after: State) -> list[Array]:
 def _prior(state: State) -> Array:
     """Prior sd of each column's coefficient over the white noise; infinite for the bias."""
     c, sd = np.abs(state.best.c[1:]), state.best.sd[1:]
-    return np.array([math.inf, *np.maximum(WIDE * (c + 2.0 * sd) / state.best.sigma, 1e-12)])
+    return np.array([math.inf, *np.maximum(WIDE_PRIOR * (c + 2.0 * sd) / state.best.sigma, 1e-12)])
 
 
 def _posterior(G: Array, D: Array, n: Array, prior: Array) -> tuple[Array, Array]:

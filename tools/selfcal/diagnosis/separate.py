@@ -16,31 +16,32 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from selfcal.diagnosis.record import LEAST, Record
+from selfcal.base.grid import Array
+from selfcal.diagnosis.record import FEWEST, Record
 from selfcal.diagnosis.statistics import states_of
 from selfcal.likelihood.columns import Shape, possible
 from selfcal.likelihood.fit import Fit, Series, ln_likelihood, run
-from selfcal.likelihood.state import Look, Regressor, State
-from selfcal.likelihood.statemodel import Array, Terms, matrices
+from selfcal.likelihood.state import FittedColumn, Look, State
+from selfcal.likelihood.statemodel import Terms, matrices
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.forms import NUMBER, curved, formed, slope
 
 #: Evidence that the next record shall have for the rival that is true, nats, in which share of so many drawn records.
 NATS, SHARE, DRAWN = 10.0, 0.9, 40
 #: Sizes of the drift over the one that is fitted without either rival: e to these.
-SIZES = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
+RIVAL_DRIFTS = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
 #: Samples in the time of the first record, and the length of the longest planned one over it.
-SAMPLES, LONGEST = 128, 4
+RECORD_SAMPLES, PLANNED_RATIO_MOST = 128, 4
 #: Places of a rival's numbers, about.
-NODES = 9
+RIVAL_PLACES = 9
 
 
 @dataclass(frozen=True)
-class Rival:
+class RivalShape:
     """A shape as the first record leaves it: its columns at each place of its numbers, and for each drift and place the
     mean [d, p, k] and the information [d, p, k, k] of their coefficients, and the probability [d, p]."""
 
-    columns: tuple[tuple[Regressor, ...], ...]
+    columns: tuple[tuple[FittedColumn, ...], ...]
     mean: Array
     information: Array
     probability: Array
@@ -79,12 +80,12 @@ def _nested(a: Shape, b: Shape) -> bool:
     return names[0] < names[1] or names[1] < names[0]
 
 
-def _known(shape: Shape, state: State) -> Rival:
+def _known(shape: Shape, state: State) -> RivalShape:
     """A shape by the first record."""
     points, _ = possible(state, shape)
-    shapes = shape.near(np.exp(points[:: 1 + len(points) // NODES])) if shape.numbers else [shape]
+    shapes = shape.near(np.exp(points[:: 1 + len(points) // RIVAL_PLACES])) if shape.numbers else [shape]
     blocks = [np.array([column.values for column in shape.regressors]) for shape in shapes]
-    drifts = [state.best.shrunk(-size) for size in SIZES]
+    drifts = [state.best.shrunk(-size) for size in RIVAL_DRIFTS]
     sums = [list(state.beside(drift.terms, drift.theta, blocks)) for drift in drifts]
     mean = np.array([[sums_of.coefficients()[0] for sums_of in each] for each in sums])
     G = np.array([[sums_of.G[1:, 1:] * sums_of.n / sums_of.coefficients()[2] for sums_of in each] for each in sums])
@@ -93,12 +94,12 @@ def _known(shape: Shape, state: State) -> Rival:
     information = np.where(np.expand_dims(known, (2, 3)), G * (1.0 + 1e-9 * unit), unit)
     ln_weight = np.array([[ln_likelihood(sums_of) for sums_of in each] for each in sums])
     ln_weight = np.where(known, ln_weight - 0.5 * np.linalg.slogdet(information)[1], -math.inf)
-    return Rival(
+    return RivalShape(
         tuple(shape.regressors for shape in shapes), mean, information, np.exp(ln_weight - logsumexp(ln_weight))
     )
 
 
-def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any]:
+def _shortest(a: RivalShape, b: RivalShape, state: State, record: Record) -> dict[str, Any]:
     """The shortest record that tells two rivals apart, with the smallest cycle that suffices in the time of the first
     record. A cycle takes a quarter of that time or more: of faster changes the first record says little."""
     causes = {name: cause for cause, name in record.channel_names.items()}
@@ -118,11 +119,11 @@ def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any
             white, ln_variance = _drawn(a, b, state, record, drive, swing, period_s)
             for share in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32):
                 duration_s = share * (period_s if drive else span / 8.0)
-                if duration_s * record.rate_hz < LEAST:
+                if duration_s * record.rate_hz < FEWEST:
                     continue
-                if duration_s > LONGEST * span or duration_s >= (plan["duration_s"] or math.inf):
+                if duration_s > PLANNED_RATIO_MOST * span or duration_s >= (plan["duration_s"] or math.inf):
                     break
-                samples = round(SAMPLES * duration_s / span)
+                samples = round(RECORD_SAMPLES * duration_s / span)
                 nats = _differences(a, b, white[:, :samples], ln_variance[:, :samples])
                 least = float(nats.mean(axis=1).min())
                 if np.mean(nats >= NATS, axis=1).min() < SHARE:
@@ -139,14 +140,14 @@ def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any
 
 
 def _drawn(
-    a: Rival, b: Rival, state: State, record: Record, drive: str, swing: float, period_s: float
+    a: RivalShape, b: RivalShape, state: State, record: Record, drive: str, swing: float, period_s: float
 ) -> tuple[Array, Array]:
     """The longest record in which a channel is cycled and the others are held, [d, n, 1 + m + 2 DRAWN]: a level, the
     columns of both rivals, and readings drawn under each, behind the filter of every drift; ln of their variances [d,
     n]. The part stays switched on after the first record."""
     span = record.present.size / record.rate_hz
-    dt = span / SAMPLES
-    n = LONGEST * SAMPLES
+    dt = span / RECORD_SAMPLES
+    n = PLANNED_RATIO_MOST * RECORD_SAMPLES
     passed = (np.arange(n) + 0.5) * dt
     random = np.random.default_rng(1)
     held = {name: record.channels[cause] for cause, name in record.channel_names.items()}
@@ -161,7 +162,7 @@ def _drawn(
         np.array([[_column(regressor, values, t, dt) for regressor in each] for each in rival.columns])
         for rival in (a, b)
     ]
-    drifts = [_drift(state.best.shrunk(-size), dt) for size in SIZES]
+    drifts = [_drift(state.best.shrunk(-size), dt) for size in RIVAL_DRIFTS]
     readings = []
     for rival, columns in zip((a, b), rows, strict=True):
         p = rival.probability
@@ -185,7 +186,7 @@ def _noise(drift: tuple[Terms, Array, float], dt: float, n: int, random: np.rand
     return np.asarray(sigma * (random.standard_normal(n) + states))
 
 
-def _column(column: Regressor, values: Mapping[str, Array], t: Array, dt: float) -> Array:
+def _column(column: FittedColumn, values: Mapping[str, Array], t: Array, dt: float) -> Array:
     """[n]: a column of the model file in a record with these channels, `t` s from power-on."""
     entry = column.entry
     if entry["kind"] == "turn_on":
@@ -207,7 +208,7 @@ def _drift(at: Fit, dt: float) -> tuple[Terms, Array, float]:
     return terms, theta, (at.N_of_color if at.terms.color else at.N) / math.sqrt(dt)
 
 
-def _differences(a: Rival, b: Rival, white: Array, ln_variance: Array) -> Array:
+def _differences(a: RivalShape, b: RivalShape, white: Array, ln_variance: Array) -> Array:
     """Evidence for the true rival over the other one in the drawn records of `_drawn`, nats [2, DRAWN]."""
     G = white.transpose(0, 2, 1) @ white
     ln_det = ln_variance.sum(axis=1) + np.log(G[:, 0, 0])

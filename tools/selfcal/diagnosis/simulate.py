@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal import _reference
 from selfcal.adequacy.one_over_f import FLICKER, beside_its_law
 from selfcal.base.errors import UserError, printable
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Channels, Key, Setting, is_count
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.logs import recording
@@ -21,12 +21,12 @@ from selfcal.model.file import Group, Model
 from selfcal.model.laws import NAMED, PARAMETERS, PLACES, Law
 
 #: Streams of random numbers from here on draw what the model file leaves open; those below are the simulator's.
-DRAWS = 2**32
+SEEDS = 2**32
 
 
 def added_by(
     applied: Sequence[Mapping[str, Any]], model: Model, rate_hz: float, seed: int
-) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None] | None:
+) -> Callable[[Array, Array, Array], None] | None:
     """Adds the effects that a cause forms by itself, and the quantity that moves several axes, to `values` [axes, n]
     before the read-out; None without any."""
     own = [(form, effect["axes"]) for effect in applied if (form := CAUSES[effect["id"]].simulated.add) is not None]
@@ -34,7 +34,7 @@ def added_by(
     if not own and hidden is None:
         return None
 
-    def add(values: NDArray[np.float64], temperature: NDArray[np.float64], supply: NDArray[np.float64]) -> None:
+    def add(values: Array, temperature: Array, supply: Array) -> None:
         time_s = np.arange(temperature.size) / rate_hz
         axes = dict(zip(model.axes, values.copy(), strict=True))
         for number, (form, chosen) in enumerate(own):
@@ -51,21 +51,21 @@ def added_by(
     return add
 
 
-def _markov(deviation: float, rate: float, n: int, random: np.random.Generator) -> NDArray[np.float64]:
+def _markov(deviation: float, rate: float, n: int, random: np.random.Generator) -> Array:
     """A Gauss-Markov process [n] of this rate a sample."""
     from scipy.signal import lfilter
 
     steps = random.standard_normal(n) * math.sqrt(-math.expm1(-2.0 * rate))
     steps[0] = random.standard_normal()
-    found: NDArray[np.float64] = deviation * lfilter([1.0], [1.0, -math.exp(-rate)], steps)
+    found: Array = deviation * lfilter([1.0], [1.0, -math.exp(-rate)], steps)
     return found
 
 
-def read_out(
+def put_faults(
     applied: Sequence[Mapping[str, Any]],
     model: Model,
     axes: Sequence[_reference.Axis],
-    values: NDArray[np.float64],
+    values: Array,
     rate_hz: float,
     random: _reference.Random,
 ) -> tuple[float, int] | None:
@@ -83,14 +83,14 @@ def read_out(
     return changed
 
 
-def slower(
-    stamps: NDArray[np.float64], columns: Mapping[str, tuple[str, NDArray[np.float64]]], time_s: float, block: int
-) -> tuple[NDArray[np.float64], dict[str, tuple[str, NDArray[np.float64]]]]:
+def slowed(
+    stamps: Array, columns: Mapping[str, tuple[str, Array]], time_s: float, block: int
+) -> tuple[Array, dict[str, tuple[str, Array]]]:
     """Means of `block` rows from `time_s` on, at the time of the last."""
     first = int(np.searchsorted(stamps, time_s))
     end = first + (stamps.size - first) // block * block
 
-    def taken(row: NDArray[np.float64]) -> NDArray[np.float64]:
+    def taken(row: Array) -> Array:
         return np.concatenate([row[:first], row[first:end].reshape(-1, block).mean(axis=1)])
 
     slower = np.concatenate([stamps[:first], stamps[first:end].reshape(-1, block)[:, -1]])
@@ -154,7 +154,7 @@ def truth_of(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         where = f"axes.{name}"
         fields = model.simulate["axes"].get(name, {})
         # All are drawn, in one order, so that stating one leaves the others as they were.
-        random = _reference.Random(seed, DRAWS + number)
+        random = _reference.Random(seed, SEEDS + number)
         priors = model.group_of(name).priors
         law = _pick(model.hypotheses, random.uniform())
         drawn = {"bias": priors["bias"].sd * random.normal()}

@@ -11,31 +11,29 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import gammainc, gammaincc, log_ndtr, ndtr, ndtri, stdtr, stdtrit
 
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.likelihood.fit import Fit, Series, run
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array, Mask, Matrices, matrices
+from selfcal.likelihood.statemodel import Matrices, matrices
 from selfcal.readings.lattice import WHITE_REMAINDERS
 
-Indices = NDArray[np.int64]
-
 #: Simulated records a band rests on.
-ENSEMBLE = 48
+BAND_RECORDS = 48
 #: Fewest simulated records that have a statistic.
-FEWEST = 8
+RECORDS_LEAST = 8
 #: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
 LEAST_SPREAD = {"longest_repeat": 0.25, "repeated_readings": 1.0, "commonest_reading": 1.0}
 #: Times at least that the drift forgets in a record in which jumps are looked for.
-TURNS_LEAST = 50.0
+FORGETS_LEAST = 50.0
 #: Name of the statistic of a model that does not describe the readings at all.
 SPREAD = "innovation_spread"
 #: Samples of the blocks whose sums show slow correlation.
-BLOCKS = (4, 16, 64, 256)
+BLOCK_SIZES = (4, 16, 64, 256)
 #: The longest averaging time of an Allan deviation is this part of a record.
-LONGEST = 8
+ALLAN_PART = 8
 #: Share of simulated records beyond which the tail of the most striking statistic is fitted.
 TAIL = 1.0 / 3.0
 #: Lags of the correlation, roughly a factor 1.6 apart.
@@ -54,7 +52,7 @@ class Statistic:
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedStatistics:
     """Every statistic of a state against its band, the most striking first; `p`: probability that the most striking of
     a fitting record is as striking."""
 
@@ -97,13 +95,13 @@ def _of_memory(filled: Array, present: Mask, n: int, lagged: Array) -> Iterator[
         if lag < min(lagged.size, n // 8):
             yield f"innovation_lag{lag}", float(lagged[lag])
     yield "innovation_correlation_to_lag_20", _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
-    for size in BLOCKS:
+    for size in BLOCK_SIZES:
         if n >= 60 * size:
             sums = np.add.reduceat(filled, np.arange(0, filled.size - size + 1, size))
             scale = math.sqrt(sums.size) * float(sums.var())
             for lag in (1, 2, 3, 5):
                 yield f"innovation_lag{lag}_of_{size}_samples", float(sums[lag:] @ sums[:-lag]) / scale
-    sizes = 2 ** np.arange(max(1, int(math.log2(n / LONGEST)) + 1))
+    sizes = 2 ** np.arange(max(1, int(math.log2(n / ALLAN_PART)) + 1))
     for m, deviation in zip(sizes, allan_deviation(np.where(present, filled, np.nan), sizes), strict=True):
         if math.isfinite(deviation):
             yield f"allan_of_{m}_samples", _root(n * float(deviation) ** 2, n / float(m))
@@ -194,7 +192,7 @@ def _of_readings(y: Array, lsb: float) -> dict[str, float]:
     return found
 
 
-def allan_deviation(y: Array, sizes: Indices) -> Array:
+def allan_deviation(y: Array, sizes: Rows) -> Array:
     """Allan deviation of y [n] (NaN: missing) for means of `sizes` samples. A pair of means counts if each has half of
     its samples. Pairs begin an eighth of a mean apart, in long records further."""
     good = np.isfinite(y)
@@ -233,7 +231,7 @@ def jumps_of(answer: Array) -> Callable[[Array], float] | None:
     count = answer.size // block
     g = answer[: count * block].reshape(count, block).sum(axis=1)
     forgets = count * (1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300))
-    if forgets < TURNS_LEAST:
+    if forgets < FORGETS_LEAST:
         return None
     padded = 2 * next_fast_len(count)
     spectrum, size = np.conj(rfft(g, padded)), np.sqrt(np.cumsum(g**2)[::-1])
@@ -379,21 +377,21 @@ def _drawn(state: State, random: np.random.Generator, count: int) -> Iterator[tu
         yield w, w
 
 
-def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> Judged:
+def judged(state: State, seed: int = 0, count: int = BAND_RECORDS) -> JudgedStatistics:
     """Every statistic of the state against `count` records of its model."""
     jumps = jumps_of(_step_response(state.series, state.best))
     measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, jumps)
     if SPREAD in measured:
-        return Judged([Statistic(SPREAD, measured[SPREAD], 0.9, 1.1, 0.0)], 0.0)
+        return JudgedStatistics([Statistic(SPREAD, measured[SPREAD], 0.9, 1.1, 0.0)], 0.0)
     rows = []
     for w, y in _drawn(state, np.random.default_rng(seed), count):
         found = all_statistics(w, None if state.redrawn else y, state.lsb, jumps)
         rows.append([found.get(name, math.nan) for name in measured])
     sample = np.array(rows).reshape(count, len(measured))
-    usual = np.isfinite(sample).sum(axis=0) >= FEWEST
+    usual = np.isfinite(sample).sum(axis=0) >= RECORDS_LEAST
     names = [name for name, kept in zip(measured, usual, strict=True) if kept]
     if not names:
-        return Judged([], 1.0)
+        return JudgedStatistics([], 1.0)
     sample, value = sample[:, usual], np.array([measured[name] for name in names])
     # A statistic that some records do not have is usual in those.
     sample = np.where(np.isfinite(sample), sample, np.nanmean(sample, axis=0))
@@ -405,7 +403,7 @@ def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> Judged:
         Statistic(name, float(value[k]), float(mean[k] - half[k]), float(mean[k] + half[k]), math.exp(ln_p[k]))
         for k, name in enumerate(names)
     ]
-    return Judged(sorted(found_all, key=lambda statistic: statistic.p), _family(ln_p, sample, least))
+    return JudgedStatistics(sorted(found_all, key=lambda statistic: statistic.p), _family(ln_p, sample, least))
 
 
 def _ln_tails(values: Array, sample: Array, least: Array, *, own: bool = False) -> Array:

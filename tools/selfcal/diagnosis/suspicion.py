@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from selfcal.adequacy.document import to_document
 from selfcal.adequacy.identify import identify_axis
-from selfcal.bank.blocks import FEWEST
+from selfcal.adequacy.identify_document import identify_document
+from selfcal.bank.blocks import BLOCKS_LEAST
 from selfcal.bank.priors import MOST_INTERVALS, add_sources, for_record
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.finding import UNEXPLAINED
 from selfcal.diagnosis.loop import LOOKS
-from selfcal.diagnosis.record import Record, of_recording
+from selfcal.diagnosis.record import Record, record_from
 from selfcal.likelihood.fit import ROUGH_FTOL
 from selfcal.likelihood.state import NET_LEAST, SLOW_S, Look, State
 from selfcal.logs.recording import Recording, as_float
@@ -43,7 +43,7 @@ def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[
 def rough(recording: Recording, model: Model, axes: Sequence[str]) -> tuple[Record, dict[str, State]]:
     """Means of SLOW_S, or MOST_INTERVALS longer ones, and a rough fit of each of the axes that can be judged, less the
     motion. Raises UserError for a record that is too short."""
-    record = of_recording(recording, model, min(1.0 / SLOW_S, recording.rate_hz, MOST_INTERVALS / recording.duration_s))
+    record = record_from(recording, model, min(1.0 / SLOW_S, recording.rate_hz, MOST_INTERVALS / recording.duration_s))
     states = {name: record.axes[name] for name in axes if name in record.axes and not record.axes[name].below_lattice}
     return record, {name: state.masked(record.moving).refit(ftol=ROUGH_FTOL) for name, state in states.items()}
 
@@ -82,7 +82,7 @@ def with_added_laws(
             model = for_record(of_file, whole, (name,))
             axis = identify_axis(whole, name, model, engine, decimate, draw=draw)
             if axis.result.best not in before:
-                own = to_document(recording, {name: axis})
+                own = identify_document(recording, {name: axis})
                 add_sources(own, of_file, model)
                 document["axes"][name] = own["axes"][name] | {"suspicion": shown.cause, "added_law": axis.result.best}
                 again.append(name)
@@ -98,7 +98,7 @@ def _whole_means(recording: Recording, bank_rate_hz: float) -> Recording:
     place = recording.clock.place
     cell = (place - place[0]) // block
     whole = np.bincount(cell) == block
-    if np.count_nonzero(whole) < FEWEST:
+    if np.count_nonzero(whole) < BLOCKS_LEAST:
         raise UserError("too few bank intervals have all of their readings")
     return recording.with_rows(whole[cell])
 

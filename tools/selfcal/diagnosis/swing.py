@@ -16,21 +16,21 @@ from scipy.fft import rfft
 from scipy.ndimage import uniform_filter1d
 
 from selfcal.likelihood.columns import FIT_ADDS, NEARLY
-from selfcal.likelihood.fit import Fit, best, finish, left, moved
+from selfcal.likelihood.fit import Fit, best, fit_at, left, moved
 from selfcal.likelihood.state import State, net
 from selfcal.likelihood.statemodel import PERIOD_LIMITS
 from selfcal.model.laws import DAMPING_LIMITS, SWING_LEAST
 
 #: Turns in a record at least.
-TURNS_LEAST = 3.0
+SWING_TURNS_LEAST = 3.0
 #: Drifts behind which slow swings are looked for: smaller by exp(-these).
-SIZES = (0.0, 1.5, 4.0)
+SWING_DRIFTS = (0.0, 1.5, 4.0)
 #: Widths of a mean of the periodogram, bins. Half the width of a band is this share of the mean that shows it.
-WIDTHS, SHARE = tuple(2**k for k in range(1, 10)), 0.3
+MEAN_BINS, HALF_WIDTH_SHARE = tuple(2**k for k in range(1, 10)), 0.3
 #: Above this damping a fast band is coloured or flicker noise.
-NARROW = 0.25
+DAMPING_MOST = 0.25
 #: Swings that one model may have beside a slow one.
-MOST = 5
+SWINGS_MOST = 5
 #: ln of the bins of the spectrum less this is the price of a search: by 800 clean records at 1 and 10 Hz, of swings
 #: that forget their phase.
 LN_FEWER = 4.4
@@ -66,8 +66,8 @@ def found(state: State, *, slow: bool) -> Swing | None:
     fit adds no more than a drift of two terms alone gains, and FIT_ADDS."""
     n, span = state.y.size, state.y.size * state.dt
     border = span / max(PERIOD_LIMITS[0], SWING_LEAST * state.dt)
-    low, high = (max(TURNS_LEAST, span / PERIOD_LIMITS[1]), border) if slow else (border, 0.5 * n)
-    start = _search(state, low, high, SIZES if slow else SIZES[:1], 1.0 if slow else NARROW)
+    low, high = (max(SWING_TURNS_LEAST, span / PERIOD_LIMITS[1]), border) if slow else (border, 0.5 * n)
+    start = _search(state, low, high, SWING_DRIFTS if slow else SWING_DRIFTS[:1], 1.0 if slow else DAMPING_MOST)
     price = max(0.0, math.log(max(high - low, 1.0)) - LN_FEWER)
     if start is None or net(start[2] + FIT_ADDS, 3, price) < NEARLY:
         return None
@@ -76,7 +76,7 @@ def found(state: State, *, slow: bool) -> Swing | None:
         gain -= max(0.0, state.rich.ln_likelihood - state.best.ln_likelihood)
     swing = Swing(fits, gain, net(gain, 3, price))
     period, damping, _ = swing.numbers
-    inside = low < span / period < high and (slow or damping < NARROW)
+    inside = low < span / period < high and (slow or damping < DAMPING_MOST)
     return swing if swing.net >= 1.0 and inside else None
 
 
@@ -99,16 +99,16 @@ def _search(
         drift = fit.shrunk(less)
         white = left(state.series, drift, np.empty((0, n)))[:, 0]
         power = np.abs(rfft(white)) ** 2 / (fit.sigma**2 * fit.n)
-        for width in WIDTHS:
+        for width in MEAN_BINS:
             mean = np.maximum(uniform_filter1d(power, width, mode="reflect"), 1.0)
             gain = width * (mean - 1.0 - np.log(mean)) - np.log(np.maximum(place / width, 1.0))
-            inside = (mean > 1.0) & (place >= low) & (place < high) & (SHARE * width < most * place)
+            inside = (mean > 1.0) & (place >= low) & (place < high) & (HALF_WIDTH_SHARE * width < most * place)
             if not inside.any():
                 continue
             at = int(np.argmax(np.where(inside, gain, -math.inf)))
             size = 0.5 * math.log(2.0 * width * (float(mean[at]) - 1.0) / n)
-            damping = math.log(min(SHARE * width / at, DAMPING_LIMITS[1]))
+            damping = math.log(min(HALF_WIDTH_SHARE * width / at, DAMPING_LIMITS[1]))
             own = {"ln_period": math.log(n * state.dt / at), "ln_damping": damping, "ln_swing": size}
-            value = finish(state.series, terms, moved(drift, terms, own)).ln_likelihood - fit.ln_likelihood
+            value = fit_at(state.series, terms, moved(drift, terms, own)).ln_likelihood - fit.ln_likelihood
             tried.append((own, less, value))
     return max(tried, key=lambda each: each[2], default=None)

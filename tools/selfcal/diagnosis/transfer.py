@@ -20,11 +20,11 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
-from selfcal.diagnosis.forms import LONGEST_LAG, agreement
-from selfcal.likelihood.columns import LN_SLOW, nodes, top
+from selfcal.base.grid import Array
+from selfcal.diagnosis.channel_looks import LONGEST_LAG, agreement
+from selfcal.likelihood.columns import LN_SLOW, number_nodes, top
 from selfcal.likelihood.fit import Fit, Sums, left, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
-from selfcal.likelihood.statemodel import Array
 from selfcal.model.forms import POWER, played, slope
 
 Complex = NDArray[np.complex128]
@@ -43,9 +43,9 @@ LN_CHOICE = 1.0
 #: ln of the number of independent looks: the structures and their numbers.
 LN_STRUCTURES = math.log(42.0)
 #: Structures within so many nats of the best are scored beside a drift of two terms.
-NEAR = 10.0
+NEAR_NATS = 10.0
 #: Tapers of the empirical spectra, their half bandwidth in bins, and the bands of a decade.
-TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 3, 2.5, 8
+SPECTRUM_TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 3, 2.5, 8
 #: Both columns lose their slow power below this bin first: a spectrum as steep as a temperature's would fill the bands
 #: beside its own. The ratio stays.
 CORNER = 20.0
@@ -267,7 +267,7 @@ def late(values: Array, lag_s: complex, dt: float) -> NDArray[Any]:
 
 
 @dataclass(frozen=True)
-class Tried:
+class Trial:
     """A structure at its best point: its columns [k, n], the gain of ln likelihood, its score (half BIC and the choice,
     nats), and the fit."""
 
@@ -280,7 +280,7 @@ class Tried:
 
 
 @dataclass(frozen=True)
-class Posterior:
+class Draws:
     """Draws of a structure's numbers: coefficients `c` [draws, k] and the filter's `shape` [draws, m]."""
 
     structure: Structure
@@ -298,7 +298,7 @@ class Posterior:
         return np.asarray(-np.angle(self.at(slowest) / self.at(np.zeros(1)))[:, 0] / (2.0 * math.pi * slowest[0]))
 
 
-def tried(state: State, drive: Drive, structure: Structure) -> Tried:
+def tried(state: State, drive: Drive, structure: Structure) -> Trial:
     """A structure at its best point: of those tried first, and the numbers of a filter then looked for between them."""
     points = drive.points(structure)
     blocks = drive.each(structure, points)
@@ -312,10 +312,10 @@ def tried(state: State, drive: Drive, structure: Structure) -> Tried:
     columns = drive.columns(structure, point)
     gain, fit = state.with_columns(columns)
     free = len(columns) + len(structure.shape)
-    return Tried(structure, point, columns, gain, gain - free * (0.5 * math.log(fit.n) + LN_CHOICE), fit)
+    return Trial(structure, point, columns, gain, gain - free * (0.5 * math.log(fit.n) + LN_CHOICE), fit)
 
 
-def beside_two_terms(state: State, found: Sequence[Tried]) -> list[Tried]:
+def beside_two_terms(state: State, found: Sequence[Trial]) -> list[Trial]:
     """The structures with scores beside a drift of two terms, and the fit with that drift where it is clearly better.
 
     A drift of one term that follows quick errors of a structure leaves slow columns some nats of their own."""
@@ -324,17 +324,17 @@ def beside_two_terms(state: State, found: Sequence[Tried]) -> list[Tried]:
     best = max(found, key=lambda trial: trial.score)
     base = max(state.rich.ln_likelihood, state.best.ln_likelihood)
 
-    def refitted(trial: Tried) -> tuple[Fit, float]:
+    def refitted(trial: Trial) -> tuple[Fit, float]:
         fit = refit(state.series.beside(trial.columns), state.rich)
         clearly = fit.ln_likelihood > trial.fit.ln_likelihood + ALIKE
         return fit if clearly else trial.fit, fit.ln_likelihood - base - trial.gain
 
     of_best = refitted(best)[1]
-    near = [refitted(trial) if trial.score > best.score - NEAR else (trial.fit, of_best) for trial in found]
+    near = [refitted(trial) if trial.score > best.score - NEAR_NATS else (trial.fit, of_best) for trial in found]
     return [replace(trial, score=trial.score + more, fit=fit) for trial, (fit, more) in zip(found, near, strict=True)]
 
 
-def worth(state: State, trial: Tried) -> float:
+def worth(state: State, trial: Trial) -> float:
     """Evidence of an influence, -ln p: net of the search, and of an input's decay that any drift might have."""
     own = len(trial.structure.keys)
     start = max(0.0, state.with_columns(trial.columns[own:])[0]) if own < len(trial.columns) else 0.0
@@ -342,7 +342,7 @@ def worth(state: State, trial: Tried) -> float:
     return net(gain, own + len(trial.structure.shape), LN_STRUCTURES + own * LN_SLOW)
 
 
-def posterior(state: State, drive: Drive, trial: Tried) -> Posterior:
+def posterior(state: State, drive: Drive, trial: Trial) -> Draws:
     """Draws over coefficients, the filter's numbers, and the drift: every near one, and its parameters."""
     structure = trial.structure
     drifts = [
@@ -358,7 +358,7 @@ def posterior(state: State, drive: Drive, trial: Tried) -> Posterior:
         return np.array([state.scores(each, replace(fit, theta=theta)) for fit, theta, _ in far])
 
     # At the likeliest drift, and at the largest, which leaves most possible.
-    points, steps = nodes(scores, trial.point, drive.limits(structure))
+    points, steps = number_nodes(scores, trial.point, drive.limits(structure))
     blocks = drive.each(structure, np.exp(points))
     k = len(trial.columns)
     ln_weight, means, roots, places = [], [], [], []
@@ -378,7 +378,7 @@ def posterior(state: State, drive: Drive, trial: Tried) -> Posterior:
     # Within a cell of the lattice any point is as likely.
     inside = random.uniform(-0.5, 0.5, (DRAWS, len(steps))) @ steps.T
     shape = np.exp(np.clip(points[np.array(places)[drawn]] + inside, *np.log(drive.limits(structure)).T))
-    return Posterior(structure, c[:, : len(structure.keys)], shape)
+    return Draws(structure, c[:, : len(structure.keys)], shape)
 
 
 def _flat(fit: Fit, theta: Array) -> float:
@@ -394,7 +394,7 @@ def _ln_weight(sums: Sums) -> float:
     return ln_likelihood(sums) + 0.5 * ln_det(rss / sums.n * inverse)
 
 
-def held_out(state: State, trial: Tried) -> float:
+def held_out(state: State, trial: Trial) -> float:
     """What the influence gains on the last third, nats a sample. The drift and the size of the noise are of the part
     before; so are the coefficients, with what that part leaves open of them."""
     n = state.y.size
@@ -413,7 +413,7 @@ def held_out(state: State, trial: Tried) -> float:
     return (rest(trial.columns) - rest(np.empty((0, n)))) / max(1, int(np.isfinite(state.y[mark:]).sum()))
 
 
-def left_over(state: State, drive: Drive, trial: Tried) -> float:
+def left_over(state: State, drive: Drive, trial: Trial) -> float:
     """-ln p of residuals that still go with the input, net of the number of looks.
 
     At any frequency in any phase, so whatever the lag, and with one coefficient: with each column of the structure, the
@@ -434,7 +434,7 @@ def left_over(state: State, drive: Drive, trial: Tried) -> float:
 
 
 def source(
-    state: State, drive: Drive, trial: Tried, drawn: Posterior, misfits: Sequence[str], *, acts_back: bool
+    state: State, drive: Drive, trial: Trial, drawn: Draws, misfits: Sequence[str], *, acts_back: bool
 ) -> tuple[str, str]:
     """Whether the record tells that the input acts: "input first", "cannot tell" or "no structure", and the reason in
     words. `misfits`: what contradicts the structure. `acts_back`: the output may act on the input. No axis acts on a
@@ -479,7 +479,7 @@ class Empirical:
 
 def empirical(u: Array, y: Array, dt: float) -> Empirical:
     """The empirical transfer function of an input u [n] and an output y [n] without missing samples."""
-    tapers = windows.dpss(u.size, HALF_WIDTH, TAPERS)
+    tapers = windows.dpss(u.size, HALF_WIDTH, SPECTRUM_TAPERS)
     pole = math.exp(-2.0 * math.pi * CORNER / u.size)
     U, Y = (np.fft.rfft(tapers * lfilter([1.0, -1.0], [1.0, -pole], detrend(signal))) for signal in (u, y))
     low, high = math.ceil(HALF_WIDTH), U.shape[1] - 1
@@ -489,7 +489,7 @@ def empirical(u: Array, y: Array, dt: float) -> Empirical:
     # reduceat's last band runs on to the end.
     width = np.diff(np.append(edges[:-1], U.shape[1]))
     # Neighbouring bins share their tapers' band.
-    freedom = np.maximum(TAPERS, TAPERS * width / (2.0 * HALF_WIDTH) + (TAPERS - 1) / 2.0)
+    freedom = np.maximum(SPECTRUM_TAPERS, SPECTRUM_TAPERS * width / (2.0 * HALF_WIDTH) + (SPECTRUM_TAPERS - 1) / 2.0)
     ratio: Complex = np.asarray(Suy / Suu, np.complex128)
     coherence = np.clip(np.abs(Suy) ** 2 / (Suu * Syy), 0.0, 1.0)
     sd = np.sqrt((1.0 - coherence) * Syy / Suu / (2.0 * (freedom - 1.0)))

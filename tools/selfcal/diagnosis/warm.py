@@ -1,8 +1,8 @@
 """Warm start: what `diagnose` measured of a part becomes the prior of this part's module.
 
 The next rest of the part is another one: at another temperature, after another start. Its parameter differs from this
-record's by RUN_TO_RUN, sd of the logarithm, beside what the record leaves open. The prior is log-uniform within REACH
-times both together, and so WIDENED times as wide as both. A coefficient's prior is normal and as wide.
+record's by RUN_TO_RUN, sd of the logarithm, beside what the record leaves open. The prior is log-uniform within
+PRIOR_REACH times both together, and so WIDENED times as wide as both. A coefficient's prior is normal and as wide.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.bank.result import FAINT, HALF_90
+from selfcal.bank.axis_result import HALF_90, LAW_LEAST
 from selfcal.base import units
-from selfcal.base.errors import UserError, short, shown
+from selfcal.base.errors import UserError, short, short_value
 from selfcal.base.limits import read_text, reading
 from selfcal.model.file import LONGEST_TEXT, MOST_HYPOTHESES, Model
 from selfcal.model.laws import PARAMETERS, PLACES, RATIOS
 from selfcal.model.tables import HypothesisTable, PriorLaw, PriorRow, RegressorTable, Tables
 
 #: Half the width of a measured prior, in sd of what is expected of ln(parameter); sd of that prior over this sd.
-REACH = 4.0
-WIDENED = REACH / math.sqrt(3.0)
+PRIOR_REACH = 4.0
+WIDENED = PRIOR_REACH / math.sqrt(3.0)
 #: sd of ln(parameter) from one rest of a part to its next, by place: N; the drift parameter; alpha or the ratio.
 #: From three runs of one ADIS16405 (tests/ACCURACY.md, "Warm start"). Of a coefficient, assumed: the runs have no
 #: temperature.
 RUN_TO_RUN = {"N": 0.05, "K": 0.2, "sigma_m": 0.2, "B": 0.2}
 RUN_TO_RUN_COEFFICIENT = 0.1
-#: Most ln odds of a regressor: one that is FAINT may be in use in the next record, and one that is sure may not.
-MOST_LN_ODDS = math.log1p(-FAINT) - math.log(FAINT)
+#: Most ln odds of a regressor: one that is faint may be in use in the next record, and one that is sure may not.
+MOST_LN_ODDS = math.log1p(-LAW_LEAST) - math.log(LAW_LEAST)
 #: How far rounding takes a sum of probabilities beyond 1: the bank reports floats.
-ROUNDING = MOST_HYPOTHESES * float(np.finfo(np.float32).eps)
+SUM_ROUNDING = MOST_HYPOTHESES * float(np.finfo(np.float32).eps)
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def _regressor(column: RegressorTable, known: list[AxisStart | None]) -> Regress
     return replace(column, coefficient_sd=tuple(sd), coefficient_mean=tuple(mean), ln_odds=tuple(odds))
 
 
-def load(path: Path | str, model: Model) -> Start:
+def load_start(path: Path | str, model: Model) -> Start:
     """Read the file that `diagnose --json` writes. Raises UserError for any other, and for one of another model."""
     return _Reader(Path(path), model).start()
 
@@ -113,7 +113,7 @@ class _Reader:
         return UserError(f"{self.path}: {where}: {what}" if where else f"{self.path}: {what}")
 
     def tree(self) -> dict[str, Any]:
-        from selfcal.diagnosis.document import SCHEMA  # takes long to import
+        from selfcal.diagnosis.diagnose_document import SCHEMA  # takes long to import
 
         try:
             text = read_text(self.path, 1 << 25, "not a diagnosis")
@@ -123,7 +123,7 @@ class _Reader:
             tree = json.loads(text)
         told = tree.get("schema") if isinstance(tree, dict) else None
         if told != SCHEMA:
-            said = f"schema {shown(told)}" if told is not None else "no schema"
+            said = f"schema {short_value(told)}" if told is not None else "no schema"
             raise self.fail("", f"not a diagnosis: {said}, not {SCHEMA} (the JSON that `selfcal diagnose` writes)")
         assert isinstance(tree, dict)
         return tree
@@ -131,7 +131,7 @@ class _Reader:
     def mapping(self, tree: Any, key: str, where: str) -> dict[str, Any]:
         found = tree.get(key)
         if not isinstance(found, dict):
-            raise self.fail(f"{where}{key}", f"must be a mapping, not {shown(found)}")
+            raise self.fail(f"{where}{key}", f"must be a mapping, not {short_value(found)}")
         return found
 
     def number(self, tree: Mapping[str, Any], key: str, where: str, low: float = -math.inf) -> float:
@@ -142,13 +142,13 @@ class _Reader:
             number = math.inf
         if not math.isfinite(number) or number <= low:
             above = "" if low == -math.inf else f" above {low:g}"
-            raise self.fail(f"{where}.{key}", f"must be a finite number{above}, not {shown(value)}")
+            raise self.fail(f"{where}.{key}", f"must be a finite number{above}, not {short_value(value)}")
         return number
 
     def probability(self, tree: Mapping[str, Any], key: str, where: str) -> float:
         """0 to 1, and the rounding of a sum."""
         value = self.number(tree, key, where)
-        if not -ROUNDING <= value <= 1.0 + ROUNDING:
+        if not -SUM_ROUNDING <= value <= 1.0 + SUM_ROUNDING:
             raise self.fail(f"{where}.{key}", f"must be 0 to 1, not {value:g}")
         return value
 
@@ -157,7 +157,7 @@ class _Reader:
         recording = self.mapping(tree, "recording", "")
         name = Path(str(recording.get("path"))).name
         if not name.isprintable() or not 0 < len(name) <= LONGEST_TEXT:
-            raise self.fail("recording.path", f"must be the name of a file, not {shown(name)}")
+            raise self.fail("recording.path", f"must be the name of a file, not {short_value(name)}")
         duration_s = self.number(recording, "duration_s", "recording", 0.0)
         if _meaning(Model.of_tree(self.mapping(tree, "model", ""), self.path)) != _meaning(self.model):
             raise self.fail(
@@ -182,7 +182,7 @@ class _Reader:
     def axis(self, axis: str, entry: Any) -> AxisStart:
         where, group = f"axes.{axis}", self.model.group_of(axis)
         if not isinstance(entry, dict):
-            raise self.fail(where, f"must be a mapping, not {shown(entry)}")
+            raise self.fail(where, f"must be a mapping, not {short_value(entry)}")
         try:
             factor = units.factor(str(entry.get("unit")), group.unit)
         except UserError as error:
@@ -196,7 +196,7 @@ class _Reader:
         limits: dict[str, dict[str, tuple[float, float]]] = {}
         share = {law: self.probability(hypotheses, law, f"{where}.hypotheses") for law in laws}
         for law in sorted(laws, key=lambda law: -share[law]):
-            if share[law] < FAINT:
+            if share[law] < LAW_LEAST:
                 # What such a law says of N is wrong, and a wider prior would have it win where N has changed.
                 likeliest = next(iter(limits.values()), {})
                 limits[law] = {"N": likeliest["N"]} if "N" in likeliest else {}
@@ -224,7 +224,7 @@ class _Reader:
         prior = self.model.group_of(axis).priors[parameter]
         if not math.log(prior.min) <= middle <= math.log(prior.max):
             raise self.fail(f"{where}.median", f"lies outside the model's prior, {prior.min:g} to {prior.max:g}")
-        half = REACH * math.hypot((q95 - q05) / (2.0 * HALF_90), RUN_TO_RUN.get(parameter, 0.4))
+        half = PRIOR_REACH * math.hypot((q95 - q05) / (2.0 * HALF_90), RUN_TO_RUN.get(parameter, 0.4))
         return middle - half, middle + half
 
     def regressors(

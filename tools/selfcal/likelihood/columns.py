@@ -16,21 +16,20 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.base.grid import block_means
+from selfcal.base.grid import Array, block_means
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import (
     ALIKE,
     NET_LEAST,
     SCREEN,
+    FittedColumn,
     Look,
-    Regressor,
     State,
     gain_for,
-    interval,
     mixture,
     net,
+    normal_entry,
 )
-from selfcal.likelihood.statemodel import Array
 
 #: A drift that is known from few of its own turns leaves slow columns a longer tail. Of 2267 clean axes at 1 and 10 Hz
 #: 7 showed 7 nats of a supply or a temperature and 2 of a ramp at a price of 0.8, where 4 and 2 were due; the tail ran
@@ -42,14 +41,14 @@ LN_EITHER = math.log(2.0)
 SMALLER = (1.5, 3.0)
 #: Forms of a family, or events of a search, that are fitted: those that rank best. After the first one only forms whose
 #: score is within so many nats, and this share of the best, of what a form needs to be taken, or to be as likely.
-FITTED, FIT_ADDS, COARSE = 3, 3.0, 0.05
+FITTED, FIT_ADDS, FIT_SHARE = 3, 3.0, 0.05
 #: Numbers between those of the grid: steps of their logarithms, the first and the last.
 STEP_FIRST, STEP_LAST = 0.35, 0.005
 #: Worth from which on a shape may be named, or be as likely as the one that is, nats.
 NEARLY = NET_LEAST - ALIKE
 #: A number's posterior is on a lattice of such steps, standard deviations, as far as ln likelihood is this much lower,
 #: with so many nodes at most. How far off the standard deviation is looked for first, and how often.
-NODE, POSSIBLE, NODES_MOST, REACH_FIRST, REACHES = 0.5, 7.0, 500, 0.01, 10
+NODE, POSSIBLE_NATS, NUMBER_NODES_MOST, REACH_FIRST, REACHES = 0.5, 7.0, 500, 0.01, 10
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ class Shape:
 
     form: str
     columns: Array
-    regressors: tuple[Regressor, ...]
+    regressors: tuple[FittedColumn, ...]
     keys: tuple[tuple[str, str], ...]
     price: float | Callable[[float], float] = 0.0
     free: int = 1
@@ -173,7 +172,7 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = N
             break
         k = max(left, key=lambda k: shapes[k].worth(gains[k]))
         most = max((trial.net for trial in done.values()), default=-math.inf)
-        if done and shapes[k].worth(gains[k]) < max(most - ALIKE, NET_LEAST) - FIT_ADDS - COARSE * most:
+        if done and shapes[k].worth(gains[k]) < max(most - ALIKE, NET_LEAST) - FIT_ADDS - FIT_SHARE * most:
             break
         best = fitted(state, shapes[k])
         gains = np.maximum(gains, state.scores(blocks, best.fit))
@@ -265,9 +264,9 @@ def _estimate(chosen: Tried) -> dict[str, Any]:
     shape, fit = chosen.shape, chosen.fit
     k = len(shape.columns)
     c, sd = _sizes(shape, fit.c[-k:], fit.sd[-k:])
-    found = {key: interval(float(c[j]), float(sd[j]), unit) for j, (key, unit) in enumerate(shape.keys)}
+    found = {key: normal_entry(float(c[j]), float(sd[j]), unit) for j, (key, unit) in enumerate(shape.keys)}
     values = shape.told(np.array(shape.theta))
-    numbers = {number.key: interval(float(values[number.key]), 0.0, number.unit) for number in shape.numbers}
+    numbers = {number.key: normal_entry(float(values[number.key]), 0.0, number.unit) for number in shape.numbers}
     return {**shape.where(fit), **found, **numbers, **shape.stated}
 
 
@@ -302,7 +301,7 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
 
 
 def possible(state: State, shape: Shape) -> tuple[Array, Array]:
-    """As `nodes`, of a shape's numbers beside the drift that is fitted with it."""
+    """As `number_nodes`, of a shape's numbers beside the drift that is fitted with it."""
     if not shape.numbers:
         return np.empty((1, 0)), np.empty((0, 0))
     fit = fitted(state, shape).fit
@@ -310,10 +309,10 @@ def possible(state: State, shape: Shape) -> tuple[Array, Array]:
     def scores(thetas: Array) -> Array:
         return state.scores([other.columns for other in shape.near(thetas)], fit)[None]
 
-    return nodes(scores, shape.theta, shape.limits)
+    return number_nodes(scores, shape.theta, shape.limits)
 
 
-def nodes(scores: Callable[[Array], Array], start: Sequence[float], limits: Array) -> tuple[Array, Array]:
+def number_nodes(scores: Callable[[Array], Array], start: Sequence[float], limits: Array) -> tuple[Array, Array]:
     """Logarithms of numbers that the record leaves possible [points, m], on a lattice about the best with the steps
     [m, m], its columns. `scores` [d, points] of [points, m] at some drifts, the likeliest first."""
     limits, m = np.log(limits), len(limits)
@@ -332,13 +331,13 @@ def nodes(scores: Callable[[Array], Array], start: Sequence[float], limits: Arra
         reach = np.where(flat, 1.6 * reach, reach)
     found: dict[tuple[int, ...], Array] = {}
     seen = waiting = {(0,) * m}
-    while waiting and len(found) < NODES_MOST:
+    while waiting and len(found) < NUMBER_NODES_MOST:
         inside = [at for at in waiting if np.all(np.abs(np.clip(x := middle + steps @ at, *limits.T) - x) < 1e-9)]
         if not inside:
             break
         values = scores(np.exp([middle + steps @ at for at in inside])).T
         best = np.maximum(best, values.max(axis=0))
-        near = {at: value for at, value in zip(inside, values, strict=True) if np.any(value > best - POSSIBLE)}
+        near = {at: value for at, value in zip(inside, values, strict=True) if np.any(value > best - POSSIBLE_NATS)}
         found |= near
         moves = [(j, way) for j in range(m) for way in (1, -1)]
         waiting = {tuple(x + way * (i == j) for i, x in enumerate(at)) for at in near for j, way in moves} - seen

@@ -10,20 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.base.grid import Rows
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.likelihood.columns import LN_SLOW, Shape
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
-from selfcal.likelihood.state import Regressor, State, interval, ln_looks, mixture, net
-from selfcal.likelihood.statemodel import Array, Mask
+from selfcal.likelihood.state import FittedColumn, State, ln_looks, mixture, net, normal_entry
 
 #: Least share of its information that a step keeps beside the level before it; and the least share of a mid-record
 #: step's information at the last place that is looked at.
-INFORMATION_LEAST = 0.05
+STEP_SHARE_LEAST = 0.05
 #: A drift that forgets more often than this in the record gives way to a step: its size is fitted anew beside it, and
 #: noise alone gains as two coefficients do. Of 683 clean records at 1 Hz 17 instead of 4.6 showed 5 nats with one.
 FORGETS = 5.0
 #: Samples between two edges at least: a shorter pulse is outliers'. Samples at the ends where no edge of one lies.
-SHORTEST, EDGE = 10, 4
+EDGES_APART, EDGE = 10, 4
 #: Places with less than e^-8 of the best one's likelihood between them are two steps'. Places of the posterior that
 #: hold less than the second are left out, and beyond so many the least likely.
 VALLEY, WEIGHT_LEAST, MOST_PLACES = 8.0, 1e-7, 1600
@@ -85,9 +84,9 @@ def scan(series: Series, fit: Fit, held: Array | None = None) -> Scan:
     present = np.flatnonzero(np.isfinite(series.y))
     if held is None:
         known = found.A / float(np.median(found.A[present]))
-        enough = np.flatnonzero(known >= INFORMATION_LEAST)
+        enough = np.flatnonzero(known >= STEP_SHARE_LEAST)
         A[: present[0] + 4] = A[min(present[-1] - 2, enough[-1] + 1) :] = 0.0
-        A = np.where(A < INFORMATION_LEAST * found.A, 0.0, A)
+        A = np.where(A < STEP_SHARE_LEAST * found.A, 0.0, A)
     else:
         own, size = inverse @ G[1:p, p], G[p, p] - G[1:p, p] @ inverse @ G[1:p, p]
         B -= G[p, 0] - G[1:p, p] @ c
@@ -137,7 +136,7 @@ def edge(state: State, fit: Fit, places: tuple[int, ...], k: int) -> Scan:
         return scan(state.series, fit)
     n, other = state.y.size, places[1 - k]
     found, where = scan(state.series, fit, raised(n, other)), np.arange(n)
-    out = (where < other + SHORTEST) | (where > n - EDGE) if k else (where > other - SHORTEST) | (where < EDGE)
+    out = (where < other + EDGES_APART) | (where > n - EDGE) if k else (where > other - EDGES_APART) | (where < EDGE)
     return replace(found, B=-found.B if k else found.B, A=np.where(out, 0.0, found.A))
 
 
@@ -152,7 +151,7 @@ def shape(state: State, cause: str, places: tuple[int, ...], steps: Scan) -> Sha
     return Shape(
         cause,
         values[None],
-        (Regressor(name(cause, times), cause, values, "1", entry),),
+        (FittedColumn(name(cause, times), cause, values, "1", entry),),
         (("amplitude", state.unit),),
         partial(steps.price, edges=len(places)),
         steps.free(len(places)),
@@ -175,9 +174,9 @@ def known(state: State, places: Sequence[int] | Rows, samples: Sequence[int] | R
     """When a change is: each edge lies between the last reading before it and the first one after it, so many samples
     apart. Means begin with their first reading."""
     width = np.asarray(samples) * state.dt / math.sqrt(12.0)
-    found = {"time_s": interval(float(places[0] - 0.5 / state.block) * state.dt, float(width[0]), "s")}
+    found = {"time_s": normal_entry(float(places[0] - 0.5 / state.block) * state.dt, float(width[0]), "s")}
     if len(places) > 1:
-        found["duration_s"] = interval(float(places[1] - places[0]) * state.dt, math.hypot(*width), "s")
+        found["duration_s"] = normal_entry(float(places[1] - places[0]) * state.dt, math.hypot(*width), "s")
     return found
 
 

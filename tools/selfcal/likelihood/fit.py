@@ -15,31 +15,31 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from selfcal import _likelihood
-from selfcal.base.grid import SLOPE_STEP
+from selfcal.base.grid import SLOPE_STEP, Array, Mask
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import LN_SIZE, PARAMETERS, Array, Mask, Terms, matrices
+from selfcal.likelihood.statemodel import LN_SIZE, PARAMETERS, Terms, matrices
 
 #: Columns that the compiled filter takes in one pass beside the record.
 COLUMNS_MOST = _likelihood.COLUMNS_MAX - 1
 #: Products of matrices that numpy leaves to one thread.
 ONE_THREAD = 200_000
 #: A column of which the others leave less than this share is one of theirs: half of a double's digits are left.
-SPENT = math.sqrt(np.finfo(float).eps)
+DEPENDENT_SHARE = math.sqrt(np.finfo(float).eps)
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
 FTOL = 0.01
 #: ... of a quick look, which ranks causes and measures none: their evidence differs by more.
 ROUGH_FTOL = 0.3
 #: Standard deviations of a model's parameters at which posteriors of coefficients are summed.
-NODES = (-2.0, -1.0, 0.0, 1.0, 2.0)
+NODE_SDS = (-2.0, -1.0, 0.0, 1.0, 2.0)
 #: A direction whose standard deviation is above this is walked instead, in such steps, while ln likelihood is within so
 #: much of the best; where it changes by less a step, the term that the parameter sizes has vanished.
-HARDLY, NODE_STEP, POSSIBLE, PLATEAU, NODES_FARTHEST = 0.7, 0.6, 4.0, 0.02, 18.0
+HARDLY, NODE_STEP, WALKED_NATS, PLATEAU, NODES_FARTHEST = 0.7, 0.6, 4.0, 0.02, 18.0
 #: Longer records know their parameters well enough: the best ones stand for all.
-NODES_MOST = 100_000
+SUMMED_SAMPLES_MOST = 100_000
 #: Steps of a fit at most, how far one goes at most in any parameter, and how much shorter one is that went too far.
-STEPS, FARTHEST, SHORTER = 40, 3.0, 0.25
+STEPS_MOST, STRIDE_MOST, SHORTER = 40, 3.0, 0.25
 #: A step that promises less than this share of `ftol` is not taken.
-SETTLED = 0.2
+PROMISE_LEAST = 0.2
 #: A size of less information than this may as well be nothing: its standard deviation is a factor of two.
 WEAK = 2.0
 #: Drifts that are nothing below a size, and where they are then looked for.
@@ -99,7 +99,7 @@ class Sums:
         rest = [0, *range(1 + known, len(self.G))]
         cross = self.G[1 : 1 + known][:, rest]
         G = self.G[np.ix_(rest, rest)] - cross.T @ inverse @ cross
-        spent = np.diag(G) < SPENT * np.diag(self.G)[rest]
+        spent = np.diag(G) < DEPENDENT_SHARE * np.diag(self.G)[rest]
         spent[0] = False
         G[spent], G[:, spent] = 0.0, 0.0
         return replace(self, G=G, x=self.x[rest])
@@ -164,7 +164,7 @@ class Fit:
         white noise."""
         terms = self.terms
         theta = self.theta + math.log(block) * terms.growth + less * terms.sizes
-        return np.where(terms.growth > 0.0, np.maximum(theta, LN_SIZE[0]), theta)
+        return np.asarray(np.where(terms.growth > 0.0, np.maximum(theta, LN_SIZE[0]), theta))
 
     @property
     def N(self) -> float:
@@ -341,7 +341,7 @@ def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
 
 def refit(series: Series, known: Fit) -> Fit:
     """The same model on much the same record, from where it was."""
-    return _climbed(series, finish(series, known.terms, known.theta))
+    return _climbed(series, fit_at(series, known.terms, known.theta))
 
 
 def fit(series: Series, terms: Terms, start: Array | None = None) -> Fit:
@@ -351,10 +351,10 @@ def fit(series: Series, terms: Terms, start: Array | None = None) -> Fit:
     and a Gauss-Markov drift may have gone there with the wrong rate."""
     low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
     starts = [start] if start is not None else _starts(terms, np.array([low, high]).T)
-    found = _climbed(series, best([finish(series, terms, np.clip(start, low, high)) for start in starts]))
+    found = _climbed(series, best([fit_at(series, terms, np.clip(start, low, high)) for start in starts]))
     promised: list[tuple[float, Fit]] = []
     for place in _larger(terms, found.theta):
-        at = finish(series, terms, place)
+        at = fit_at(series, terms, place)
         slope, information = slopes(series, at)
         k = int(np.flatnonzero(place != found.theta)[0])
         if slope[k] > 0.0:
@@ -387,22 +387,22 @@ def _climbed(series: Series, here: Fit) -> Fit:
         return here
     low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
     size = terms.growth > 0.0
-    reach = FARTHEST
-    for _ in range(STEPS):
+    reach = STRIDE_MOST
+    for _ in range(STEPS_MOST):
         slope, information = slopes(series, here)
         here = replace(here, information=information)
         if not (np.isfinite(slope).all() and np.isfinite(information).all()):
             return here
         weak = size & (np.diag(information) < WEAK)
-        falling = weak & (slope < -2.0 * SETTLED * series.ftol) & (here.theta > low)
+        falling = weak & (slope < -2.0 * PROMISE_LEAST * series.ftol) & (here.theta > low)
         while True:
             move, gain = _move(size, slope, information, low - here.theta, high - here.theta, reach)
-            if gain >= SETTLED * series.ftol:
-                there = finish(series, terms, here.theta + move)
+            if gain >= PROMISE_LEAST * series.ftol:
+                there = fit_at(series, terms, here.theta + move)
             elif falling.any():
                 move, gain = np.where(falling, low - here.theta, 0.0), 0.0
                 falling[:] = False
-                there = finish(series, terms, here.theta + move)
+                there = fit_at(series, terms, here.theta + move)
             else:
                 return here
             more = there.ln_likelihood - here.ln_likelihood
@@ -414,7 +414,7 @@ def _climbed(series: Series, here: Fit) -> Fit:
         whole = float(np.abs(move).max()) < 0.4 * reach and not (weak & (slope < 0.0)).any()
         if whole and gain < 3.0 * series.ftol and abs(more - gain) < 0.2 * gain:
             break
-        reach = min(FARTHEST, reach / SHORTER)
+        reach = min(STRIDE_MOST, reach / SHORTER)
     return here
 
 
@@ -469,7 +469,7 @@ def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
 
     Within a drift, the prior of its size is Jeffreys' for a weak walk: the information of ln rho is n rho / 2. A flat
     one counts sizes that no record tells from nothing, and intervals beside a weak walk are too short."""
-    if not found.terms.names or series.n > NODES_MOST or series.ftol > FTOL:
+    if not found.terms.names or series.n > SUMMED_SAMPLES_MOST or series.ftol > FTOL:
         return [(found.theta, 0.0)]
     spread = found.spread
     limits = np.array(found.terms.limits(found.dt)).reshape(-1, 2)
@@ -477,7 +477,7 @@ def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
     length = np.linalg.norm(spread, axis=0)
     # Of three parameters and more only the two least known are varied.
     wide = np.argsort(-length)[:2]
-    steps = [np.array(NODES) if j in wide else np.zeros(1) for j in range(k)]
+    steps = [np.array(NODE_SDS) if j in wide else np.zeros(1) for j in range(k)]
     for j in wide[length[wide] > HARDLY]:
         steps[j] = _possible(series, found, spread[:, j] / length[j], limits) / length[j]
     apart = [float(np.diff(ladder).mean()) if ladder.size > 1 else 1.0 for ladder in steps]
@@ -505,7 +505,7 @@ def _possible(series: Series, found: Fit, direction: Array, limits: Array) -> Ar
     found_at = {0.0: value(0.0)}
     for side in (-NODE_STEP, NODE_STEP):
         move = side
-        while abs(move) < NODES_FARTHEST and (now := value(move)) >= found_at[0.0] - POSSIBLE:
+        while abs(move) < NODES_FARTHEST and (now := value(move)) >= found_at[0.0] - WALKED_NATS:
             found_at[move] = now
             move += side
     moves = np.array(sorted(found_at))
@@ -513,7 +513,7 @@ def _possible(series: Series, found: Fit, direction: Array, limits: Array) -> Ar
     return moves[bent[0] : bent[-1] + 2] if bent.size else np.zeros(1)
 
 
-def finish(series: Series, terms: Terms, theta: Array) -> Fit:
+def fit_at(series: Series, terms: Terms, theta: Array) -> Fit:
     """The fit at given parameters."""
     sums = run(series, terms, theta)[0][0]
     c, inverse, rss = sums.coefficients()

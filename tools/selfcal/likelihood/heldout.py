@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.likelihood.statemodel import Array
+from selfcal.base.grid import Array
 
 #: How far ahead the bias is predicted, s.
 HORIZONS_S = (1.0, 10.0, 60.0, 300.0)
 #: Pieces of the held-out time whose scatter gives the uncertainty.
-PIECES = 24
+SCORE_PIECES = 24
 #: Least change of a number that matters, over the number.
 MATTERS = 0.05
 #: Standard deviations below 0 of a gain from which a finding is dropped.
@@ -39,7 +39,7 @@ def score_entry(before: float, after: float, sd: float, samples: float) -> dict[
     return {"log_score_per_sample": {"before": before, "after": after, "sd": sd, "samples": int(samples)}}
 
 
-def spread(steps: Array) -> float:
+def sd_of_mean(steps: Array) -> float:
     """Standard deviation of the mean of pieces."""
     return float(np.std(steps, ddof=1)) / math.sqrt(len(steps))
 
@@ -48,12 +48,12 @@ def error_entry(before: Array, after: Array) -> dict[str, float] | None:
     """Root mean squares of two errors [n] at the same places, and the deviation of their difference, by pieces three
     times as long: they last longer. None: fewer are known than a score has pieces."""
     good = np.isfinite(before) & np.isfinite(after)
-    if good.sum() < PIECES:
+    if good.sum() < SCORE_PIECES:
         return None
     squares = [error[good] ** 2 for error in (before, after)]
     rms = [math.sqrt(float(each.mean())) for each in squares]
-    first, second = (np.array([part.mean() for part in np.array_split(each, PIECES // 3)]) for each in squares)
-    return {"before": rms[0], "after": rms[1], "sd": spread(second - first) / max(sum(rms), 1e-300)}
+    first, second = (np.array([part.mean() for part in np.array_split(each, SCORE_PIECES // 3)]) for each in squares)
+    return {"before": rms[0], "after": rms[1], "sd": sd_of_mean(second - first) / max(sum(rms), 1e-300)}
 
 
 def harmful(parts: Sequence[HeldOut]) -> bool:

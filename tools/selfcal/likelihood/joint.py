@@ -23,8 +23,9 @@ from scipy.ndimage import median_filter
 from scipy.special import softmax
 
 from selfcal import _joint
+from selfcal.base.grid import Array, Mask
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS, Array, Mask
+from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS
 from selfcal.logs.recording import bridged
 
 #: Axes that a common quantity takes at least: two that go together are noise that they share.
@@ -47,7 +48,7 @@ PRIOR_SD = 3.0
 #: Standard deviations of a drift's ln size or ln rate, and of a loading over the white noise, about: units of a search.
 OF_DRIFT, OF_LOADING = 0.5, 0.1
 #: Widths of the size of a column, in its own standard deviations.
-WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+SIZE_WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 #: ln of the odds that an axis has a column which another one has, before its own readings: of axes without it, 1 in 100
 #: are then taken for one with it, 1 in 20 at even odds.
 LN_ODDS = math.log(0.25)
@@ -272,7 +273,7 @@ class _Cost:
         return value, slope
 
 
-def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None, *, held: bool = False) -> Joint:
+def fit_joint(bins: Bins, dt: float, f: bool, start: Joint | None = None, *, held: bool = False) -> Joint:
     """The model of most likelihood, with f or without. `start`: one near it, to which f is added if it has none. It
     keeps f as that has it where f is `held`."""
     cost, m = _Cost(bins, f), bins.power.shape[1]
@@ -318,7 +319,7 @@ def _least(cost: _Cost, start: Array, bounds: Array) -> tuple[float, Array]:
 
 def refitted(model: Joint, y: Array, dt: float) -> Joint:
     """The model of records [m, n] near another one, with f if that has it."""
-    return fitted(bins_of(y), dt, model.has_f, model)
+    return fit_joint(bins_of(y), dt, model.has_f, model)
 
 
 def without_each(bins: Bins, model: Joint) -> Array:
@@ -453,7 +454,7 @@ def act(score: Array, known: Array) -> Act:
     shown = own > 1e-12 * np.maximum(own.max(), 1e-300)  # of an axis without a reading where the column is, nothing
     scale = shown / np.sqrt(np.where(shown, own, 1.0))
     z, R = score * scale, known * scale[:, :, None] * scale[:, None, :]
-    widths = np.array(WIDTHS)
+    widths = np.array(SIZE_WIDTHS)
 
     def ln_bf(sets: NDArray[np.intp]) -> Array:
         values, ways = np.linalg.eigh(R[:, sets[:, :, None], sets[:, None, :]])
@@ -487,7 +488,7 @@ def _over_sets(m: int, ln_bf: Callable[[NDArray[np.intp]], Array]) -> tuple[floa
     The evidence is a sum over the sets of axes, of which every number of axes is as likely before the record. The
     probability of an axis is what its own readings say, whatever the others do."""
     sets, ln_prior, member = _sets(m)
-    worth = np.logaddexp.reduce(np.hstack([ln_bf(each) for each in sets]), axis=0) - math.log(len(WIDTHS))
+    worth = np.logaddexp.reduce(np.hstack([ln_bf(each) for each in sets]), axis=0) - math.log(len(SIZE_WIDTHS))
     total = float(np.logaddexp.reduce(worth + ln_prior))
     return total, np.asarray(softmax(worth + LN_ODDS * member.sum(axis=1)) @ member)
 

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import chdtrc, logsumexp, ndtr, softmax
 
-from selfcal.bank.result import HALF_90, of_mixture
+from selfcal.bank.axis_result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
-from selfcal.base.grid import block_means, half_means
+from selfcal.base.grid import Array, Mask, block_means, half_means
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
-from selfcal.likelihood.statemodel import PARAMETERS, PERIOD_LIMITS, Array, Mask, Terms
+from selfcal.likelihood.statemodel import PARAMETERS, PERIOD_LIMITS, Terms
 from selfcal.readings.budget import OF_MODULES, P_LOOK
 from selfcal.readings.lattice import OFF
 
@@ -28,7 +28,7 @@ NET_LEAST = -math.log(P_LOOK)
 #: at most (Markov's inequality).
 EVIDENT = -math.log(OF_MODULES["together"])
 #: A drift whose fit is so far below the best one, nats, is not tried with a candidate; with a finding it is again.
-FAR = 40.0
+HOPELESS_NATS = 40.0
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
 ALIKE = 3.0
 #: Score gains below this are not worth a refit: the refit gains about as much.
@@ -46,7 +46,7 @@ Sequential = tuple[Array, Mapping[float, Array]]
 
 
 @dataclass(frozen=True)
-class Regressor:
+class FittedColumn:
     """A column that is in an axis' model. `entry` is the model file's (without prior), empty where it
     cannot state the column; `unit` the column's."""
 
@@ -74,7 +74,7 @@ class State:
     dt: float
     level: float
     r: Array
-    regressors: tuple[Regressor, ...] = ()
+    regressors: tuple[FittedColumn, ...] = ()
     extras: Terms = NONE
     lsb: float = 0.0
     stated_lsb: float = 0.0
@@ -128,7 +128,7 @@ class State:
 
     def near(self) -> tuple[Terms, ...]:
         """Those that a candidate may make the best."""
-        least = self.best.ln_likelihood - FAR
+        least = self.best.ln_likelihood - HOPELESS_NATS
         far = {drift.terms for drift in self.fits if drift.ln_likelihood < least}
         return tuple(terms for terms in self.bases() if terms not in far)
 
@@ -402,7 +402,7 @@ class Look:
         return replace(self, estimate={**self.estimate, **self.measure(beside)})
 
 
-def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
+def normal_entry(value: float, sd: float, unit: str) -> dict[str, Any]:
     """A posterior that is normal, in the form of the contract."""
     return {
         "mean": value,

@@ -13,13 +13,10 @@ from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from selfcal.base.grid import Array, Mask
 from selfcal.model.file import ABOUT_N
 from selfcal.model.laws import DAMPING_LIMITS, lost_of, swing
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 #: A Gauss-Markov drift keeps within the default model's correlation rates, 1/s: faster ones are coloured noise.
 ALPHA_LIMITS = ABOUT_N["alpha"][:2]

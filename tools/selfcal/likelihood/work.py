@@ -15,7 +15,7 @@ from selfcal.base.ending import Stopped
 
 #: Work of an axis at most, samples times columns that the filter has run over: some 40 s of a processor. A record of
 #: more than 0.7 million samples has 6000 passes over the readings and the bias: some 50 s a million samples.
-MOST, MOST_PASSES = 8e9, 6000
+WORK_MOST, PASSES_MOST = 8e9, 6000
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -51,7 +51,7 @@ def count(samples: int, columns: int) -> None:
 
 def of_axis(samples: int) -> Work:
     """The work that an axis of so many samples may take."""
-    return Work(_now.get().stop, max(MOST, 2.0 * MOST_PASSES * samples))
+    return Work(_now.get().stop, max(WORK_MOST, 2.0 * PASSES_MOST * samples))
 
 
 @contextmanager

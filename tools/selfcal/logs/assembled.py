@@ -10,39 +10,35 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.base import units
-from selfcal.base.errors import UserError, short, shown
-from selfcal.base.grid import runs
+from selfcal.base.errors import UserError, short, short_value
+from selfcal.base.grid import Array, Mask, Rows, runs
 from selfcal.base.limits import FEWEST_ROWS, LONGEST_S, MOST_CLOCKS
 from selfcal.logs import written
-from selfcal.logs.headers import Header, number_in
+from selfcal.logs.chosen_columns import Header, number_in
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import PART, split
-from selfcal.logs.loaders.table import Rows
-from selfcal.logs.order import few, in_order
+from selfcal.logs.loaders.table import TableRows
+from selfcal.logs.order import few_rows, in_order
 from selfcal.logs.recorded import SIDE_UNITS, Column, Recording, bridged, bridged_at
 from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, has_own_clock, remarks
 
 #: Readings of a side channel for each one of a run of wild ones.
-WILD = 1000
-
-Floats = NDArray[np.float64]
-Places = NDArray[np.int64]
+READINGS_PER_WILD = 1000
 
 
 @dataclass(frozen=True)
 class _Stamps:
     """Stamps float64[n], s from the first one; their rounding; the first one, s. Fail raises UserError for a row."""
 
-    time: Floats
+    time: Array
     noise_s: float
     started_s: float
     fail: Callable[[int, str], Any]
 
 
-def assembled(rows: Rows, header: Header) -> Recording:
+def assembled(rows: TableRows, header: Header) -> Recording:
     """The recording of the rows of a table; it empties `rows.columns`: no second copy stays. Raises UserError."""
     columns: dict[str, Column] = {}
     count = rows.columns[0].size
@@ -66,7 +62,7 @@ def assembled(rows: Rows, header: Header) -> Recording:
             raise UserError(f"{rows.path}: there is no time column: add t[s]{mapped} or give --rate HZ")
         return _on_clocks(rows, rate, columns, count, None, header)
     if header.written and np.isfinite(stamps.values).all():
-        return _as_written(rows, columns, units.convert(stamps.values, stamps.unit, "s"), header)
+        return _as_written(rows, columns, units.converted(stamps.values, stamps.unit, "s"), header)
     ordered, kept = _ordered(rows, stamps, part, columns, header)
     if kept.size < count or (np.diff(kept) < 0).any():
         columns = {name: replace(column, values=column.values[kept]) for name, column in columns.items()}
@@ -83,7 +79,7 @@ def _tame(column: Column, header: Header) -> Column:
     gaps = np.flatnonzero((near[:-1] > 0.0) & (near[1:] > 3.0 * near[:-1]))
     if not gaps.size:
         return column
-    wild = [known[a:b] for a, b in runs(off > near[gaps[0]]) if b - a <= max(1, known.size // WILD)]
+    wild = [known[a:b] for a, b in runs(off > near[gaps[0]]) if b - a <= max(1, known.size // READINGS_PER_WILD)]
     if not wild:
         return column
     rows = np.concatenate(wild)
@@ -95,15 +91,15 @@ def _tame(column: Column, header: Header) -> Column:
 
 
 def _ordered(
-    rows: Rows, stamps: Column, part: Column | None, columns: Mapping[str, Column], header: Header
-) -> tuple[_Stamps, Places]:
+    rows: TableRows, stamps: Column, part: Column | None, columns: Mapping[str, Column], header: Header
+) -> tuple[_Stamps, Rows]:
     """The stamps in their order, and the rows of the table that they are of. `part`: what is added to the stamps. With
     `skip_bad` rows with a damaged stamp are left out, rows out of order are sorted."""
     mend = header.asked.skip_bad
     number = [field.name for field in rows.fields].index("t")
     known = np.flatnonzero(np.isfinite(stamps.values))
     unknown = stamps.values.size - known.size
-    if unknown and not (mend and few(unknown, stamps.values.size)):
+    if unknown and not (mend and few_rows(unknown, stamps.values.size)):
         rows.fail(int(np.argmax(np.isnan(stamps.values))), number, "no time stamp (an empty cell or NaN)")
     twice = _twice(_at(stamps.values, known), (_at(column.values, known) for column in columns.values()))
     if twice.size and not mend:
@@ -112,9 +108,9 @@ def _ordered(
     known = np.delete(known, twice)
     values = _at(stamps.values, known)
     tick_s = units.factor(stamps.unit, "s") * rows.fields[number].lsb
-    since = units.convert(values - values[0], stamps.unit, "s")
+    since = units.converted(values - values[0], stamps.unit, "s")
     if part is not None:
-        since += units.convert(np.nan_to_num(part.values[known]), part.unit, "s")
+        since += units.converted(np.nan_to_num(part.values[known]), part.unit, "s")
     order = in_order(since, tick_s, mend)
     kept = known[order.rows]
     if unknown:
@@ -126,15 +122,15 @@ def _ordered(
     return (
         _Stamps(
             order.time - order.time[0],
-            units.convert(float(np.spacing(np.abs(values).max())), stamps.unit, "s"),
-            units.convert(rows.started + float(values[0]), stamps.unit, "s") + float(order.time[0]),
+            units.converted(float(np.spacing(np.abs(values).max())), stamps.unit, "s"),
+            units.converted(rows.started + float(values[0]), stamps.unit, "s") + float(order.time[0]),
             lambda row, what: rows.fail(int(kept[row]), number, what),
         ),
         kept,
     )
 
 
-def _twice(time: Floats, columns: Iterable[Floats]) -> Places:
+def _twice(time: Array, columns: Iterable[Array]) -> Rows:
     """Rows of stamps and columns [n] that are an earlier one to the bit, where stamps fall; columns are formed there
     alone. None where most rows that come late are others: a counter that wraps has some by chance."""
     none = np.empty(0, np.int64)
@@ -147,7 +143,7 @@ def _twice(time: Floats, columns: Iterable[Floats]) -> Places:
     return again if 2 * again.size > late else none
 
 
-def _as_written(rows: Rows, columns: Mapping[str, Column], t: Floats, header: Header) -> Recording:
+def _as_written(rows: TableRows, columns: Mapping[str, Column], t: Array, header: Header) -> Recording:
     """The recording of columns with NaN, and stamps `t`, s, by the clocks that `meta` states."""
     path, meta, fields = rows.path, rows.meta, rows.fields
     marks = {field.key: columns[field.name].values for field in fields if field.name.endswith(" ")}
@@ -162,7 +158,7 @@ def _as_written(rows: Rows, columns: Mapping[str, Column], t: Floats, header: He
             f"{path}: meta: its clocks are of no column of the table: convert the log again, or give --rate HZ"
         )
     _, main, main_rows = clocks[0]
-    of: dict[str, tuple[Clock | None, Places]] = dict.fromkeys(named.values(), (None, main_rows))
+    of: dict[str, tuple[Clock | None, Rows]] = dict.fromkeys(named.values(), (None, main_rows))
     for names, clock, sampled in clocks[1:]:
         other = replace(clock, start_s=clock.start_s - main.start_s)
         of.update({named[name]: (other, sampled) for name in names if name in named})
@@ -194,7 +190,7 @@ def _as_written(rows: Rows, columns: Mapping[str, Column], t: Floats, header: He
 
 
 def _on_clocks(
-    rows: Rows, rate: float | None, columns: dict[str, Column], count: int, stamps: _Stamps | None, header: Header
+    rows: TableRows, rate: float | None, columns: dict[str, Column], count: int, stamps: _Stamps | None, header: Header
 ) -> Recording:
     """The recording of columns with NaN in `count` rows at their stamps, or at `rate` without any.
 
@@ -241,7 +237,7 @@ def _on_clocks(
     )
 
 
-def _sampled(path: Path, axes: Mapping[str, NDArray[np.bool_]]) -> tuple[Places, dict[str, list[str]]]:
+def _sampled(path: Path, axes: Mapping[str, Mask]) -> tuple[Rows, dict[str, list[str]]]:
     """The rows of the recording's clock, and for each axis with a clock of its own those that share it. `axes`: where
     each has a sample, bool[rows]."""
     patterns: dict[bytes, list[str]] = {}
@@ -264,7 +260,7 @@ def _sampled(path: Path, axes: Mapping[str, NDArray[np.bool_]]) -> tuple[Places,
     return sampled, own
 
 
-def _clock_at(rows: Rows, rate: float | None, sampled: Places, stamps: _Stamps | None, count: int) -> Clock:
+def _clock_at(rows: TableRows, rate: float | None, sampled: Rows, stamps: _Stamps | None, count: int) -> Clock:
     """The clock of the samples in the rows `sampled` of so many."""
     if stamps is None:
         assert rate is not None
@@ -274,7 +270,7 @@ def _clock_at(rows: Rows, rate: float | None, sampled: Places, stamps: _Stamps |
             raise UserError(f"{rows.path}: {what}")
         return clock_of_rows(lines, rate)
     time = stamps.time
-    if count - sampled.size > 0 and few(count - sampled.size, count):
+    if count - sampled.size > 0 and few_rows(count - sampled.size, count):
         empty = np.setdiff1d(np.arange(1, count - 1), sampled)
         steps = np.diff(time)
         if empty.size and np.median(np.minimum(steps[empty - 1], steps[empty])) > 0.75 * np.median(steps):
@@ -285,7 +281,7 @@ def _clock_at(rows: Rows, rate: float | None, sampled: Places, stamps: _Stamps |
     )
 
 
-def _at(values: Floats, rows: Places) -> Floats:
+def _at(values: Array, rows: Rows) -> Array:
     """Values in these rows, in order and each once; no copy where they are all."""
     return values if rows.size == values.size else values[rows]
 
@@ -309,4 +305,4 @@ def _check_truth(path: Path, meta: Mapping[str, Any]) -> None:
             if key == "units" or (isinstance(value, str) and value == short(value)):
                 continue
             if not math.isfinite(number_in(value)):
-                raise UserError(f"{path}: meta: truth of '{short(axis)}': '{short(key)}' is {shown(value)}")
+                raise UserError(f"{path}: meta: truth of '{short(axis)}': '{short(key)}' is {short_value(value)}")

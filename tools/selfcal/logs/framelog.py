@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from selfcal.base.errors import UserError, install
+from selfcal.base.errors import UserError, install_line
 from selfcal.base.limits import BLOCK_BYTES
 from selfcal.logs.loaders.damage import SOUND, Damaged
 
@@ -428,4 +428,4 @@ def check_suffix(path: Path | str) -> None:
     if Path(path).suffix.lower() not in WRITTEN:
         raise UserError(f"{path}: the name of a frame log ends in {', '.join(WRITTEN)}")
     if str(path).lower().endswith(".mcap") and find_spec("mcap") is None:
-        raise UserError(f"{path}: mcap is not installed: {install('selfcal[mcap]')}")
+        raise UserError(f"{path}: mcap is not installed: {install_line('selfcal[mcap]')}")

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from selfcal.base.grid import Array, Rows
-from selfcal.logs.sampling import ONE_INSTANT, common_step, in_rhythm, overlapping
+from selfcal.logs.sampling import ONE_INSTANT, batches_overlap, common_step, in_rhythm
 
 #: Rows from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM = 100
@@ -63,7 +63,7 @@ def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
         count = int(np.count_nonzero(begins))
         set_back = span in _CLOCKS and count == 1
         sure = count and float(np.log(on[begins] / span).sum()) < math.log(_BY_CHANCE)
-        if not sure or not few(count, time.size) or not (set_back or np.ptp(time) < span):
+        if not sure or not few_rows(count, time.size) or not (set_back or np.ptp(time) < span):
             continue
         again = time + np.concatenate(([0.0], np.cumsum(np.where(begins, span, 0.0))))
         times = f"{count} time{'s' if count > 1 else ''}"
@@ -92,9 +92,9 @@ def broken(time: Array) -> tuple[int, str] | None:
     Stamps may repeat for being coarse. They may fall where batches of one length overlap."""
     steps = np.diff(time)
     back, repeats = steps < 0.0, steps == 0.0
-    if back.any() and not overlapping(time):
+    if back.any() and not batches_overlap(time):
         far = _far(time)
-        row = int(far[0] if far.size > 0 and few(far.size, time.size) else np.argmax(back) + 1)
+        row = int(far[0] if far.size > 0 and few_rows(far.size, time.size) else np.argmax(back) + 1)
         early = row > 0 and time[row] <= time[row - 1]
         return row, "time runs backwards" if early else "the time stamp is later than the next one"
     if repeats.any() and (not _coarse(steps) or repeats.all()):
@@ -108,7 +108,7 @@ def mends(time: Array) -> bool:
     return bool(order.notes) and broken(order.time) is None
 
 
-def few(rows: int, of: int) -> bool:
+def few_rows(rows: int, of: int) -> bool:
     """Whether so many rows may be damaged ones."""
     return rows * _DAMAGED_APART <= of
 
@@ -123,14 +123,14 @@ def _mended(order: Order) -> Order:
     kept = np.delete(np.arange(n), far)
     sort = np.argsort(time[kept], kind="stable")
     moved = int(np.count_nonzero(np.diff(time[kept]) < 0.0))
-    if not few(int(np.abs(sort - np.arange(sort.size)).max(initial=0)), n):
+    if not few_rows(int(np.abs(sort - np.arange(sort.size)).max(initial=0)), n):
         return order
     kept = kept[sort]
     repeats = np.diff(time[kept], prepend=-np.inf) == 0.0
     if repeats.any() and not _coarse(np.diff(time[kept])):
         kept = kept[~repeats]
     left_out = n - kept.size
-    if not few(left_out, n):
+    if not few_rows(left_out, n):
         return order
     if left_out:
         were = "s were" if left_out > 1 else " was"
@@ -150,5 +150,5 @@ def _far(time: Array) -> Rows:
 def _coarse(steps: Array) -> bool:
     """Whether stamps repeat for being coarse: often, or in a rhythm all the time."""
     rows = np.flatnonzero(steps == 0.0)
-    often = steps.size >= _REPEATS_FROM and not few(rows.size, steps.size)
+    often = steps.size >= _REPEATS_FROM and not few_rows(rows.size, steps.size)
     return often or (in_rhythm(rows) and 2 * int(np.ptp(rows)) > steps.size)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.base.limits import FEWEST_ROWS, LONGEST_S
 from selfcal.logs.loaders.damage import SOUND, Damaged
 from selfcal.logs.timebase import Clock
@@ -34,7 +35,7 @@ class Column:
 
     name: str
     unit: str
-    values: NDArray[np.float64]
+    values: Array
     clock: Clock | None = None
 
 
@@ -51,11 +52,11 @@ class Recording:
     path: Path
     rate_hz: float
     columns: Mapping[str, Column]
-    missing_before: NDArray[np.int64]
+    missing_before: Rows
     meta: Mapping[str, Any]
-    off_grid_s: NDArray[np.float64] | None = None
+    off_grid_s: Array | None = None
     start_s: float = 0.0
-    moving_before: NDArray[np.int64] | None = None
+    moving_before: Rows | None = None
     moving: int = 0
     started_s: float | None = None
     since_power_on_s: float = 0.0
@@ -102,15 +103,11 @@ class Recording:
     def clock(self) -> Clock:
         """The clock of all columns that have none of their own."""
         return Clock(
-            self.rate_hz,
-            self.missing_before,
-            self.off_grid_s,
-            moving_before=self.moving_before,
-            moving=self.moving,
+            self.rate_hz, self.missing_before, self.off_grid_s, moving_before=self.moving_before, moving=self.moving
         )
 
     @property
-    def time_s(self) -> NDArray[np.float64]:
+    def time_s(self) -> Array:
         """float64[n]: time since the first row on the even grid of the sampling rate, s."""
         return self.clock.time_s
 
@@ -118,7 +115,7 @@ class Recording:
         """The clock of a column."""
         return self.columns[name].clock or self.clock
 
-    def with_rows(self, kept: NDArray[np.bool_], *, moving: bool = False) -> Recording:
+    def with_rows(self, kept: Mask, *, moving: bool = False) -> Recording:
         """The recording of the rows `kept` [n] alone, two or more. The others count as missing, and as `moving` where
         that is why they are left out. Rows before the first and after the last that is kept are cut off."""
         on_grid = self.clock.place
@@ -186,14 +183,14 @@ class Recording:
             kept &= (time < begin_s - half) | (time > end_s - half)
         return self.with_rows(kept, moving=True)
 
-    def in_unit(self, name: str, unit: str) -> NDArray[np.float64]:
+    def in_unit(self, name: str, unit: str) -> Array:
         """float64[n]: a column in `unit`. Raises UserError if it is absent or of another kind."""
         if name not in self.columns:
             raise UserError(f"{self.path}: there is no column '{name}' (there are {', '.join(self.columns)})")
         column = self.columns[name]
         if not units.same_kind(column.unit, unit):
             raise UserError(f"{self.path}: column '{name}' is in {column.unit}, which cannot be converted to {unit}")
-        return units.convert(column.values, column.unit, unit)
+        return units.converted(column.values, column.unit, unit)
 
     def along(self, *names: str) -> Recording:
         """The recording by the clock of these axes: its rows are those in which one of them has a sample.
@@ -235,13 +232,13 @@ class Recording:
         )
 
 
-def bridged_at(clock: Clock, values: NDArray[np.float64], time: NDArray[np.float64]) -> NDArray[np.float64]:
+def bridged_at(clock: Clock, values: Array, time: Array) -> Array:
     """float64[n]: values of a clock at the times [n], s, by straight lines."""
     known = np.isfinite(values)
     return np.interp(time, clock.time_s[known], values[known])
 
 
-def bridged(values: NDArray[np.float64], time: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+def bridged(values: Array, time: Array | None = None) -> Array:
     """Missing values by straight lines over `time`, by default over the samples; as they are where all are missing."""
     known = np.isfinite(values)
     if known.all() or not known.any():
@@ -250,7 +247,7 @@ def bridged(values: NDArray[np.float64], time: NDArray[np.float64] | None = None
     return np.interp(time, time[known], values[known])
 
 
-def as_float(values: NDArray[np.float64]) -> NDArray[np.float32]:
+def as_float(values: Array) -> NDArray[np.float32]:
     """As the firmware gets them: what float32 cannot hold becomes infinite and is kept out."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)

@@ -18,18 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base import units
-from selfcal.base.errors import UserError, note, short, shown
+from selfcal.base.errors import UserError, note, short, short_value
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ, reading
 from selfcal.base.options import Scale
 from selfcal.base.units import SENSORS
 from selfcal.logs import arrays, written
 from selfcal.logs.assembled import assembled
-from selfcal.logs.headers import NAME_YOURS, Asked, Header
+from selfcal.logs.chosen_columns import NAME_YOURS, Asked, Header
 from selfcal.logs.loaders import check_library, format_of, texts
 from selfcal.logs.loaders.child import tables_of
 from selfcal.logs.loaders.damage import SOUND, bytes_of
 from selfcal.logs.loaders.headings import Meaning, Sensor, sides_of, split
-from selfcal.logs.loaders.sources import Part, chosen
+from selfcal.logs.loaders.sources import Share, chosen
 from selfcal.logs.loaders.table import Field, Hints, Table, meta_place
 from selfcal.logs.loaders.text_table import is_date
 from selfcal.logs.recorded import SIDE_CHANNELS, SIDE_UNITS, Column, Recording, as_float, bridged, bridged_at
@@ -127,7 +127,7 @@ def _rate(rate: Any) -> float | None:
     try:
         return None if rate is None else float(rate)
     except (TypeError, ValueError) as error:
-        raise UserError(f"the rate must be a number of Hz, not {shown(rate)}") from error
+        raise UserError(f"the rate must be a number of Hz, not {short_value(rate)}") from error
 
 
 def from_arrays(
@@ -202,7 +202,7 @@ def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
     return [first, *(replace(part, damaged=SOUND) for part in sound[1:])]
 
 
-def _parts(header: Header, table: Table, several: bool) -> list[Part]:
+def _parts(header: Header, table: Table, several: bool) -> list[Share]:
     """The sensors of a table, and the temperature in one without any."""
     keys = table.keys
     sensors = header.sensors_of(keys, table.name, table.before)
@@ -216,7 +216,7 @@ def _parts(header: Header, table: Table, several: bool) -> list[Part]:
         own = _Sensor(header, table, sensor, kept, bool(sides))
         names = set(map(own.name, kept))
         source = "/".join(name for name in (table.source, sensor.source) if name)
-        parts.append(Part(source, frozenset(names & set(header.sensors)), "temp" in names, own.span, own.read))
+        parts.append(Share(source, frozenset(names & set(header.sensors)), "temp" in names, own.span, own.read))
     return parts
 
 
@@ -364,7 +364,7 @@ def _check_gravity(recording: Recording, header: Header) -> None:
     level = np.median(means, axis=1)
     norm = float(np.linalg.norm(level))
     rests = np.linalg.norm(means - level[:, None], axis=0) < _GRAVITY_OFF * norm
-    right = units.convert(1.0, "g", axes[0].unit)
+    right = units.converted(1.0, "g", axes[0].unit)
     if not norm > 0.0 or rests.mean() < _AT_REST or abs(norm / right - 1.0) < _GRAVITY_OFF:
         return
     for unit, length in _GRAVITY.items():

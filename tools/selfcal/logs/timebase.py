@@ -12,14 +12,14 @@ from fractions import Fraction
 from typing import NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
-from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
+from selfcal.base.grid import Array, Rows
+from selfcal.base.limits import LEAST_RATE_HZ, LONGEST_S, LONGEST_SAMPLES, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
 from selfcal.logs.sampling import (
     ONE_INSTANT,
-    SAME,
+    SAME_INTERVAL,
     Ambiguous,
     common_step,
     in_pattern,
@@ -53,32 +53,32 @@ class Clock:
     """
 
     rate_hz: float
-    missing_before: NDArray[np.int64]
-    off_grid_s: NDArray[np.float64] | None = None
+    missing_before: Rows
+    off_grid_s: Array | None = None
     start_s: float = 0.0
-    moving_before: NDArray[np.int64] | None = None
+    moving_before: Rows | None = None
     moving: int = 0
 
     @property
-    def lost_before(self) -> NDArray[np.int64]:
+    def lost_before(self) -> Rows:
         """int64[n]: samples just before each that were never measured."""
         return self.missing_before if self.moving_before is None else self.missing_before - self.moving_before
 
     @property
-    def place(self) -> NDArray[np.int64]:
+    def place(self) -> Rows:
         """int64[n]: place on the grid of each sample, the missing ones counted."""
         place = np.cumsum(self.missing_before)
         place += np.arange(place.size)
         return place
 
     @property
-    def time_s(self) -> NDArray[np.float64]:
+    def time_s(self) -> Array:
         """float64[n]: time of each sample on the grid since the recording's first, s."""
         time = self.place / self.rate_hz
         time += self.start_s
         return time
 
-    def of_rows(self, rows: NDArray[np.int64], begin_s: float, *, moving: bool = False) -> Clock:
+    def of_rows(self, rows: Rows, begin_s: float, *, moving: bool = False) -> Clock:
         """The clock of these samples of it, in a recording that begins `begin_s` later. `moving`: the others are left
         out for motion."""
         place = self.place[rows]
@@ -98,18 +98,18 @@ class Clock:
     def alike(self, other: Clock) -> bool:
         """Whether both are one clock."""
         return (
-            abs(self.rate_hz / other.rate_hz - 1.0) < SAME
+            abs(self.rate_hz / other.rate_hz - 1.0) < SAME_INTERVAL
             and abs(self.start_s - other.start_s) * self.rate_hz < ONE_INSTANT
             and np.array_equal(self.missing_before, other.missing_before)
         )
 
 
-def has_own_clock(rows: NDArray[np.int64]) -> bool:
+def has_own_clock(rows: Rows) -> bool:
     """Whether the samples in these rows of a table are a slower channel's, or another sensor's between them."""
     return rhythm(np.diff(rows))[0] > 0.0
 
 
-def clock_of_rows(rows: NDArray[np.int64], rate: float) -> Clock:
+def clock_of_rows(rows: Rows, rate: float) -> Clock:
     """The clock of samples in these rows of a table without stamps, whose rows come at `rate`, Hz."""
     nats, period = rhythm(np.diff(rows))
     period = period if nats > 0.0 else 1.0
@@ -117,7 +117,7 @@ def clock_of_rows(rows: NDArray[np.int64], rate: float) -> Clock:
     return Clock(rate / period, missing, None, float(rows[0]) / rate)
 
 
-def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail) -> Clock:
+def clock_of(path: object, time: Array, noise_s: float, rate: float | None, fail: Fail) -> Clock:
     """The clock of stamps [n], s from the first row of the recording. `noise_s`: their rounding. `rate`: as the user
     states it. Raises UserError, by `fail` for a row."""
     start = float(time[0])
@@ -131,16 +131,14 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
         raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
-    if time[-1] * rate >= LONGEST:
+    if time[-1] * rate >= LONGEST_SAMPLES:
         _too_long(time, fail)
     grid = Clock(rate, missing, start_s=-missing[0] / rate).time_s
     off_grid = np.subtract(time, grid, out=grid)
     return Clock(rate, missing, off_grid, start)
 
 
-def _sampling(
-    path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail
-) -> tuple[float, NDArray[np.int64]]:
+def _sampling(path: object, time: Array, noise_s: float, rate: float | None, fail: Fail) -> tuple[float, Rows]:
     """Rate in Hz and missing_before[n] of stamps [n], s from 0."""
     fault = broken(time)
     if fault is not None:
@@ -183,7 +181,7 @@ def remarks(clock: Clock) -> list[str]:
         return [words + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
     if gaps.size:
         return []
-    if 0.0 < lattice * rate < 1.0 - SAME and steps.min() > 0.5 * lattice:
+    if 0.0 < lattice * rate < 1.0 - SAME_INTERVAL and steps.min() > 0.5 * lattice:
         turns = np.rint(steps / lattice)
         if turns.min() == 1.0 and (lattice * rate > 1.0 - _AGREES or in_pattern(turns)):
             other = float(f"{1.0 / lattice:.6g}")
@@ -202,13 +200,13 @@ def _losses(step: float) -> tuple[int, int, str]:
     return lost, every, f"{lost} sample{'s' * (lost > 1)} in {every}"
 
 
-def _ways(time: NDArray[np.float64]) -> str:
+def _ways(time: Array) -> str:
     """What to type for stamps that are out of order."""
     return f"--skip-bad mends such rows and counts them; {AS_THEY_COME}" if mends(time) else AS_THEY_COME
 
 
-def _too_long(time: NDArray[np.float64], fail: Fail) -> NoReturn:
+def _too_long(time: Array, fail: Fail) -> NoReturn:
     steps = np.diff(time, prepend=0.0)
     row = int(np.argmax(steps))
-    what = f"a recording spans at most {LONGEST_S:g} s, and {LONGEST:.2g} samples: leave the row out"
+    what = f"a recording spans at most {LONGEST_S:g} s, and {LONGEST_SAMPLES:.2g} samples: leave the row out"
     fail(row, f"the time stamp is {steps[row]:.3g} s after the one before: {what}")

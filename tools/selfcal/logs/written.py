@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, cell
 from selfcal.base.grid import Array, Rows
-from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_COLUMNS, MOST_RATE_HZ
+from selfcal.base.limits import LEAST_RATE_HZ, LONGEST_S, LONGEST_SAMPLES, MOST_COLUMNS, MOST_RATE_HZ
 from selfcal.base.output import together, whole
 from selfcal.logs.loaders import WRITTEN
 from selfcal.logs.loaders.table import heading, meta_place
@@ -133,7 +133,7 @@ def clocks_of(
                 float(entry["start_s"]),
             )
             sound = LEAST_RATE_HZ <= rate <= MOST_RATE_HZ and abs(start) < LONGEST_S and rows.size > 1
-            sound &= bool(on_grid[0] >= 0 and on_grid[-1] < min(LONGEST, LONGEST_S * rate))
+            sound &= bool(on_grid[0] >= 0 and on_grid[-1] < min(LONGEST_SAMPLES, LONGEST_S * rate))
             sound &= bool((on_grid == np.rint(on_grid)).all())
             sound &= bool((np.diff(on_grid) > 0).all() and np.isfinite(stamps).all())
             stamped = bool(entry["stamped"])
@@ -154,10 +154,10 @@ def clocks_of(
 
 def save(
     path: Path | str,
-    columns: Mapping[str, tuple[str, NDArray[np.float64]]],
+    columns: Mapping[str, tuple[str, Array]],
     rate_hz: float,
     meta: Mapping[str, Any] | None = None,
-    t: NDArray[np.float64] | None = None,
+    t: Array | None = None,
     lsb: Mapping[str, float] | None = None,
     *,
     exact: bool = False,
@@ -191,7 +191,7 @@ def save(
             beside.write_text(json.dumps({**described, "rows": len(values)}, indent=1) + "\n", encoding="utf-8")
 
 
-def _save_exact(path: Path, header: str, values: NDArray[np.float64]) -> None:
+def _save_exact(path: Path, header: str, values: Array) -> None:
     """Write values [rows, columns] as CSV by their shortest texts that are read back to the bit."""
     opened = gzip.open if path.suffix == ".gz" else open
     with opened(path, "wt", encoding="utf-8") as file:
@@ -206,9 +206,9 @@ def _save_exact(path: Path, header: str, values: NDArray[np.float64]) -> None:
 
 def _save_npz(
     path: Path,
-    columns: Mapping[str, tuple[str, NDArray[np.float64]]],
+    columns: Mapping[str, tuple[str, Array]],
     described: dict[str, Any],
-    t: NDArray[np.float64] | None,
+    t: Array | None,
     lsb: Mapping[str, float],
 ) -> None:
     """Write the columns, whole numbers of an LSB where `lsb` has its size, and `described` as the member `meta`."""

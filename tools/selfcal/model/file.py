@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base import units
-from selfcal.base.errors import UserError, short, shown
+from selfcal.base.errors import UserError, short, short_value
+from selfcal.base.grid import Array
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 from selfcal.base.units import SENSORS
 from selfcal.model.forms import FORMS, HOST_FORMS, INPUTS, NUMBER, POWER, Knots
@@ -38,7 +38,7 @@ from selfcal.model.laws import (
 SCHEMA = "selfcal.model/1"
 DEFAULT = Path(__file__).parent / "models" / "default.yaml"
 #: Model files of common parts, one a part; the default model is that of the ADIS16405.
-PARTS = DEFAULT.parent / "parts"
+PARTS_FOLDER = DEFAULT.parent / "parts"
 DEFAULT_PART = "adis16405"
 
 #: Prior limits of parameters that no law of the file has: as in the default model at 1 Hz; and whether they multiply
@@ -75,7 +75,7 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
 #: Most hypotheses of one model, in the host's library and on the wire.
 MOST_HYPOTHESES: int = _library32.HYPOTHESES_MAX
 #: Most columns of a bank's regressors together, and most that a model file may state.
-MOST_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
+MOST_BANK_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Prior:
         """sd of the logarithm; of a uniform prior that of a log-uniform one, as the library has it."""
         return self.sd if self.law == "log_normal" else math.log(self.max / self.min) / math.sqrt(12.0)
 
-    def ln_density(self, ln_value: NDArray[np.float64]) -> NDArray[np.float64]:
+    def ln_density(self, ln_value: Array) -> Array:
         """ln of the density in ln(parameter) [m] between the limits."""
         if self.law == "log_normal":
             within = math.log(math.erf(LOG_NORMAL_REACH / math.sqrt(2.0)) * math.sqrt(2.0 * math.pi) * self.sd)
@@ -284,7 +284,7 @@ class Model:
     def left_out(self) -> list[str]:
         """What a bank leaves out, in words."""
         names = ", ".join(regressor.name for regressor in self.beyond)
-        said = f"a bank has {MOST_COLUMNS} columns, and leaves out {names}: `diagnose` alone takes them"
+        said = f"a bank has {MOST_BANK_COLUMNS} columns, and leaves out {names}: `diagnose` alone takes them"
         beyond = [f"{self.path}: {said}"] if names else []
         if self.hidden_input is None:
             return beyond
@@ -316,14 +316,14 @@ def with_room(regressors: Sequence[Regressor]) -> tuple[Regressor, ...]:
     """Regressors that a bank has columns for: in their order, each whole or not at all."""
     kept: list[Regressor] = []
     for regressor in regressors:
-        if sum(len(other.columns) for other in (*kept, regressor)) <= MOST_COLUMNS:
+        if sum(len(other.columns) for other in (*kept, regressor)) <= MOST_BANK_COLUMNS:
             kept.append(regressor)
     return tuple(kept)
 
 
 def parts() -> dict[str, Path]:
     """Model files of the parts that the package has, by name."""
-    return dict(sorted({DEFAULT_PART: DEFAULT, **{path.stem: path for path in PARTS.glob("*.yaml")}}.items()))
+    return dict(sorted({DEFAULT_PART: DEFAULT, **{path.stem: path for path in PARTS_FOLDER.glob("*.yaml")}}.items()))
 
 
 def file_of(model: Path | str | None) -> Path:
@@ -442,21 +442,21 @@ class _Reader:
     def flag(self, tree: Mapping[str, Any], key: str, where: str) -> bool:
         value = tree.get(key, False)
         if not isinstance(value, bool):
-            raise self.fail(f"{where}.{key}", f"must be true or false, not {shown(value)}")
+            raise self.fail(f"{where}.{key}", f"must be true or false, not {short_value(value)}")
         return value
 
     def number(self, value: Any, where: str, *, low: float = 0.0, strict: bool = True) -> float:
         try:
             number = float(value)  # YAML reads 1e-3 without a dot as text
         except (TypeError, ValueError, OverflowError):
-            raise self.fail(where, f"must be a number, not {shown(value)}") from None
+            raise self.fail(where, f"must be a number, not {short_value(value)}") from None
         if LARGEST < abs(number) < math.inf:
             raise self.fail(where, f"must be within +-{LARGEST:g}: the firmware computes in float")
         if 0.0 < abs(number) < SMALLEST:
             raise self.fail(where, f"must be 0, or {SMALLEST:.0e} and more: the firmware computes in float")
         if isinstance(value, bool) or not math.isfinite(number) or number < low or (strict and number == low):
             bound = "" if low == -math.inf else f" above {low:g}" if strict else f" of at least {low:g}"
-            raise self.fail(where, f"must be a finite number{bound}, not {shown(value)}")
+            raise self.fail(where, f"must be a finite number{bound}, not {short_value(value)}")
         return number
 
     def within(self, value: Any, where: str, limits: tuple[float, float], unit: str = "") -> float:
@@ -470,12 +470,12 @@ class _Reader:
 
     def count(self, value: Any, where: str, low: int, high: int = np.iinfo(np.int32).max) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            raise self.fail(where, f"must be a whole number from {low} to {high}, not {shown(value)}")
+            raise self.fail(where, f"must be a whole number from {low} to {high}, not {short_value(value)}")
         return value
 
     def choice(self, value: Any, where: str, known: tuple[str, ...]) -> str:
         if value not in known:
-            raise self.fail(where, f"unknown {shown(value)} ({', '.join(known)})")
+            raise self.fail(where, f"unknown {short_value(value)} ({', '.join(known)})")
         return str(value)
 
     def text(self, tree: Mapping[str, Any], key: str, where: str) -> str:
@@ -484,7 +484,7 @@ class _Reader:
         plain = isinstance(value, str | int | float) and not isinstance(value, bool)
         if not plain or not text.isprintable() or len(text) > LONGEST_TEXT or "*/" in text:
             what = f"one line of text, {LONGEST_TEXT} characters at most, without '*/': the tables have it as a comment"
-            raise self.fail(f"{where}.{key}" if where else key, f"must be {what}, not {shown(value)}")
+            raise self.fail(f"{where}.{key}" if where else key, f"must be {what}, not {short_value(value)}")
         return text
 
     def unit(self, tree: Mapping[str, Any], where: str) -> str:
@@ -522,7 +522,7 @@ class _Reader:
             low = self.number(self.entry(fields, "min", where), f"{where}.min")
             prior = Prior(law, low, self.number(self.entry(fields, "max", where), f"{where}.max", low=low))
         else:
-            raise self.fail(where, f"unknown law {shown(law)} (log_uniform, uniform or log_normal)")
+            raise self.fail(where, f"unknown law {short_value(law)} (log_uniform, uniform or log_normal)")
         low, high = prior.min, prior.max
         least, most = RATIO_LIMITS
         if where.rpartition(".")[2] in RATIOS and not (least <= low and high <= most):
@@ -590,7 +590,7 @@ class _Reader:
             raise self.fail(where, "must be a mapping")
         kind = self.entry(tree, "kind", where)
         if not isinstance(kind, str) or kind not in REGRESSORS:
-            raise self.fail(where, f"unknown kind {shown(kind)} ({', '.join(REGRESSORS)})")
+            raise self.fail(where, f"unknown kind {short_value(kind)} ({', '.join(REGRESSORS)})")
         fields = self.only(tree, ("name", "kind", "sd", "probability", *REGRESSORS[kind]), where)
         shapes = dict.fromkeys(("periodic", "step", "turn_on", "pulse"), "1")
         unit = {"time": "s", **shapes}.get(kind) or self.unit(fields, where)
@@ -637,7 +637,7 @@ class _Reader:
         knots: list[tuple[float, float]] = []
         for i, pair in enumerate(tree):
             if not isinstance(pair, list) or len(pair) != 2:
-                raise self.fail(f"{where}[{i}]", f"must be a pair [channel, height], not {shown(pair)}")
+                raise self.fail(f"{where}[{i}]", f"must be a pair [channel, height], not {short_value(pair)}")
             channel, height = (self.number(x, f"{where}[{i}]", low=-math.inf, strict=False) for x in pair)
             if knots and not channel > knots[-1][0]:
                 raise self.fail(f"{where}[{i}]", "the channel's values must rise")
@@ -703,7 +703,7 @@ class _Reader:
         if name not in KINDS:
             plain, more = ([key for key, kind in KINDS.items() if kind.needs_time == needs] for needs in (False, True))
             kinds = f"{', '.join(plain)}, or a mapping with one of these or {', '.join(more)} as kind"
-            raise self.fail(where, f"must be {kinds}, not {shown(tree)}")
+            raise self.fail(where, f"must be {kinds}, not {short_value(tree)}")
         kind = KINDS[name]
         self.only(fields, ("kind", "deviation", *kind.keys), where)
         stated = kind.needs_time or kind.time in fields
@@ -728,7 +728,7 @@ class _Reader:
         terms = self.entry(tree, "terms", where)
         coloured = self.flag(tree, "coloured_noise", where)
         if not isinstance(terms, list):
-            raise self.fail(f"{where}.terms", f"must be a list of terms, not {shown(terms)}")
+            raise self.fail(f"{where}.terms", f"must be a list of terms, not {short_value(terms)}")
         most = MOST_TERMS - (1 if coloured else 0)
         law = Law(tuple(self.term(entry, f"{where}.terms[{i}]") for i, entry in enumerate(terms)), coloured)
         if len(law.read) > most:
@@ -760,7 +760,7 @@ class _Reader:
                 weights[name], laws[name] = self.number(entry, where), NAMED[name]
                 continue
             if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w{0,31}", name, re.ASCII):
-                raise self.fail("hypotheses", f"{shown(name)}: a name is of letters, digits and '_', 32 at most")
+                raise self.fail("hypotheses", f"{short_value(name)}: a name is of letters, digits and '_', 32 at most")
             if not isinstance(entry, dict):
                 known = ", ".join(NAMED)
                 raise self.fail(where, f"is no named law ({known}): state its probability and its terms")
@@ -786,7 +786,9 @@ class _Reader:
             raise self.fail("simulate.axes", "must be a mapping of axes")
         for name in stated:
             if name not in axes:
-                raise self.fail("simulate.axes", f"the model has no axis {shown(name)} (it has {', '.join(axes)})")
+                raise self.fail(
+                    "simulate.axes", f"the model has no axis {short_value(name)} (it has {', '.join(axes)})"
+                )
         known = ("hypothesis", "bias", *PLACES)
         known_laws = dict.fromkeys((*NAMED, *laws))
         truths = {name: dict(self.only(truth or {}, known, f"simulate.axes.{name}")) for name, truth in stated.items()}
@@ -794,7 +796,7 @@ class _Reader:
             where = f"simulate.axes.{name}"
             law = truth.get("hypothesis", "constant")
             if not isinstance(law, str) or law not in known_laws:
-                raise self.fail(f"{where}.hypothesis", f"unknown {shown(law)} (known: {', '.join(known_laws)})")
+                raise self.fail(f"{where}.hypothesis", f"unknown {short_value(law)} (known: {', '.join(known_laws)})")
             for key in truth.keys() - {"hypothesis"}:
                 truth[key] = self.number(truth[key], f"{where}.{key}", low=-math.inf if key == "bias" else 0.0)
         return {**fields, "axes": truths, "effects": texts}
@@ -806,7 +808,7 @@ class _Reader:
             raise self.fail("hidden_input.law", "must be a list of one term: kind: markov, deviation, alpha")
         term = self.only(law[0], ("kind", "deviation", "alpha"), "hidden_input.law")
         if term.get("kind") != "markov":
-            raise self.fail("hidden_input.law", f"the kind must be markov, not {shown(term.get('kind'))}")
+            raise self.fail("hidden_input.law", f"the kind must be markov, not {short_value(term.get('kind'))}")
         deviation, alpha = (
             self.number(self.entry(term, key, "hidden_input.law"), f"hidden_input.law.{key}")
             for key in ("deviation", "alpha")
@@ -818,7 +820,7 @@ class _Reader:
                 raise self.fail(f"hidden_input.{key}", "must be a mapping")
             for name in entries:
                 if not all(axis in axes for axis in str(name).split("-")):
-                    raise self.fail(f"hidden_input.{key}", f"the model has no axis {shown(name)}")
+                    raise self.fail(f"hidden_input.{key}", f"the model has no axis {short_value(name)}")
             numbers.append(
                 {name: self.number(value, f"hidden_input.{key}.{name}", low=low) for name, value in entries.items()}
             )
@@ -827,7 +829,7 @@ class _Reader:
     def model(self, raw: Mapping[str, Any]) -> Model:
         needed = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
         if raw.get("schema") != SCHEMA:
-            raise self.fail("schema", f"must be {SCHEMA}, not {shown(raw.get('schema'))}")
+            raise self.fail("schema", f"must be {SCHEMA}, not {short_value(raw.get('schema'))}")
         more = ("regressors", "half_life_s", "gate", "handle", "correlation_time_s", "hidden_input")
         tree = self.only(raw, (*needed, *more), "")
         name = self.text(tree, "name", "")
@@ -838,7 +840,7 @@ class _Reader:
             raise self.fail("groups", "must be a mapping of at least one group")
         for key in groups_tree:
             if not isinstance(key, str) or not key.isprintable() or len(key) > LONGEST_TEXT:
-                raise self.fail("groups", f"a group's name must be text, not {shown(key)}")
+                raise self.fail("groups", f"a group's name must be text, not {short_value(key)}")
         groups = tuple(self.group(name, fields, laws) for name, fields in groups_tree.items())
         regressors = self.regressors(tree.get("regressors") or [], groups)
         kept = with_room(regressors)

@@ -13,11 +13,9 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal import _library32
-
-_Floats = NDArray[np.float64]
+from selfcal.base.grid import Array
 
 #: Most terms of one law, states of its drift and coloured noise together.
 MOST_TERMS: int = _library32.TERMS_MAX
@@ -73,11 +71,11 @@ class Sized(NamedTuple):
 #: white noise that the means lack. An oscillation is the real part of a drift of complex numbers.
 Averages = tuple[float, tuple[tuple[complex, complex], ...], float]
 #: Weight of each state now in a term some time on, and the variance that the term gains until then.
-Later = tuple[tuple[_Floats, ...], _Floats]
+Later = tuple[tuple[Array, ...], Array]
 
 
 @dataclass(frozen=True)
-class Kind:
+class TermKind:
     """A kind of term: all that tools/ knows of it.
 
     `later(term, time_s)` and `averages(term, dt_s, block)`: the term ahead, and in means of `block` readings. `keys`:
@@ -129,10 +127,10 @@ def _oscillation_averages(term: Sized, dt_s: float, block: int) -> Averages:
 
 
 #: Kinds of terms, in the order of `selfcal_term_kind_t`.
-KINDS: dict[str, Kind] = {
-    "walk": Kind(_walk_later, _walk_averages),
-    "markov": Kind(_markov_later, _markov_averages, ("bandwidth", "correlation_time_s"), "correlation_time_s"),
-    "oscillation": Kind(
+KINDS: dict[str, TermKind] = {
+    "walk": TermKind(_walk_later, _walk_averages),
+    "markov": TermKind(_markov_later, _markov_averages, ("bandwidth", "correlation_time_s"), "correlation_time_s"),
+    "oscillation": TermKind(
         _oscillation_later,
         _oscillation_averages,
         ("period_s", "damping"),
@@ -251,7 +249,7 @@ def averaged(x: float, block: int) -> tuple[float, float]:
     return gain, gain - (1.0 + phi + 2.0 * phi * math.expm1(-x) / rate) / rate
 
 
-def swing(period_s: float, damping: float, time_s: float) -> _Floats:
+def swing(period_s: float, damping: float, time_s: float) -> Array:
     """[2, 2]: transition over `time_s` of x'' + 2 damping w x' + w^2 x = white noise, w = 2 pi / period_s.
 
     The states are x and x' / w: both have the stationary variance of x, and do not correlate."""
@@ -295,6 +293,6 @@ SUMS = tuple(name for name, law in NAMED.items() if law.is_sum)
 PLAIN = tuple(name for name, law in NAMED.items() if not law.is_sum)
 
 
-def named(name: str, correlation_time_s: float = math.nan) -> Law:
+def named_law(name: str, correlation_time_s: float = math.nan) -> Law:
     """A named law; `correlation_time_s` is for walk_and_markov."""
     return NAMED[name].with_time(correlation_time_s)

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model, Regressor
 from selfcal.model.forms import KIND, Source, curved, delayed, made, played, source_of, variance_of
@@ -28,7 +28,7 @@ _SHAPES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 Choice = tuple[Regressor, ...]
 
 
-def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
+def columns_of(regressors: Sequence[Regressor], recording: Recording) -> Array:
     """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
     The library forms them (`selfcal_form()`), as it does on a module. A play, a delay and a curve, which it lacks, are
@@ -51,7 +51,7 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
         for name, unit, by in channels
     ]
     rows = np.column_stack([as_float(row) for row in values]) if values else np.empty((recording.samples, 0))
-    sources = [source for regressor in regressors for source in sources_of(regressor, channels)]
+    sources = [source for regressor in regressors for source in column_sources(regressor, channels)]
     columns = made(sources, 1.0 / recording.rate_hz, rows, missing, recording.powered)
     first = 0
     for regressor in regressors:
@@ -101,7 +101,7 @@ def _channel(regressor: Regressor) -> tuple[str, str, str]:
     return regressor.column, regressor.channel_unit, regressor.input
 
 
-def sources_of(regressor: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
+def column_sources(regressor: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
     """`selfcal_source_t` of each column of a regressor."""
     if regressor.kind in _SHAPES:
         names, keys = _SHAPES[regressor.kind]
@@ -113,7 +113,7 @@ def sources_of(regressor: Regressor, channels: Sequence[tuple[str, str, str]]) -
     return [source_of(regressor.form, channel, regressor.number, regressor.reference, regressor.mean_s)]
 
 
-def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+def trailing_mean(values: Array, window: int) -> Array:
     """float64[n]: mean of the last `window` values at each, of fewer at the beginning, as a module forms it."""
     if window <= 1:
         return values

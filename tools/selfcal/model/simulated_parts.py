@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
+from selfcal.base.grid import Array
 from selfcal.base.units import SENSOR_UNITS, STANDARD_GRAVITY
-
-Floats = NDArray[np.float64]
 
 #: Axes of a part, and the unit of each.
 AXES = SENSOR_UNITS
@@ -43,7 +41,7 @@ def generator(law: str, seed: int, stream: int) -> np.random.Generator:
     return np.random.default_rng([seed, LAWS.index(law), stream])
 
 
-def simulate(law: str, samples: int, seed: int, *, axis: str = "gx", rate_hz: float = 1.0) -> tuple[Floats, Floats]:
+def simulate_axis(law: str, samples: int, seed: int, *, axis: str = "gx", rate_hz: float = 1.0) -> tuple[Array, Array]:
     """Readings of an axis, means over 1 / `rate_hz`, and the bias in them, both [samples]; units of AXES.
 
     The bias is the turn-on bias and a drift that stands still for the time of a reading.

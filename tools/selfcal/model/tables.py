@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from enum import IntEnum, auto
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ
 from selfcal.base.units import same_kind
 from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior
 from selfcal.model.laws import KINDS, NAMED, PARAMETERS, PLACES, Law
-from selfcal.model.regressors import channels_of, sources_of
+from selfcal.model.regressors import channels_of, column_sources
 
 #: Most samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
@@ -45,7 +45,7 @@ class Grid:
     """One grid dimension: `nodes` even steps; `fit` [nodes, nodes] turns node values into B-spline coefficients."""
 
     nodes: int
-    fit: NDArray[np.float64]
+    fit: Array
 
 
 @functools.cache
@@ -56,7 +56,7 @@ def make_grid(nodes: int) -> Grid:
     return Grid(nodes, np.asarray(np.linalg.inv(_basis(z, knots, 5)), np.float64))
 
 
-def _basis(z: NDArray[np.float64], knots: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+def _basis(z: Array, knots: Array, degree: int) -> Array:
     """B-splines [points, splines] at `z` by the recursion of Cox and de Boor. The same as scipy's design matrix, whose
     import takes longer than `identify` of an hour."""
     interval = np.searchsorted(knots, z, side="right") - 1
@@ -294,7 +294,7 @@ def _regressor_tables(model: Model, names: Sequence[str]) -> Iterator[RegressorT
         channels = channels_of((regressor,))
         for place, column in enumerate(regressor.columns):
             odds = len(names) * (ln_odds if place == 0 else 0.0,)
-            kind, _, number, second = sources_of(regressor, channels)[place]
+            kind, _, number, second = column_sources(regressor, channels)[place]
             source = (kind, number, second, *(channels[0][:2] if channels else ("", "")))
             yield RegressorTable(column, regressor.unit, regressor.offset, sd, source, odds)
 

@@ -36,12 +36,12 @@ OF_MODULES: Mapping[str, float] = MappingProxyType(
 #: Of sound batches, units, calibrations and comparisons, by what says that one is not.
 FALSE_ALARM = 1e-3
 #: Axes of a module, by which its shares are split.
-AXES = len(SENSORS)
+AXES_COUNT = len(SENSORS)
 #: Independent looks at an axis, in effect: the eight checks, and eleven of `diagnose`. Of 348 axes of clean modules
 #: (seeds 1000 to 1028 of `make false-alarms`, 1 and 10 Hz) 17 gain 5.4 nats for some cause, as 11 e^-5.4 of them do.
-LOOKS = 19
+LOOKS_IN_EFFECT = 19
 #: Of looks at an axis: by chance as rare as 4 standard deviations, or 9.7 nats.
-P_LOOK = OF_MODULES["looks"] / (AXES * LOOKS)
+P_LOOK = OF_MODULES["looks"] / (AXES_COUNT * LOOKS_IN_EFFECT)
 #: Largest deviation of a look's statistic that passes, sd: 4.
 CHECK_LIMIT = -NormalDist().inv_cdf(0.5 * P_LOOK)
 #: Nats by which an explanation is clearly better than another: by chance at most once in 20 (Markov's bound).

@@ -25,15 +25,15 @@ from selfcal.readings.lattice import COARSEST, FINE, Lattice, step_of
 #: Codes or cells at most, and readings at least.
 CODES, READINGS_LEAST = 400, 300
 #: Pieces of a record that have a level each, at most, and readings in one at least.
-PIECES, PIECE = 100, 64
+LEVEL_PIECES, PIECE_ROWS = 100, 64
 #: Share of the readings from which on the commonest value has no part in the steps that show the noise.
-COMMON = 0.2
+COMMON_SHARE = 0.2
 #: Cells in the noise of readings on no lattice; parts of true values in one, and points of them.
-CELLS, PARTS, POINTS = 4.0, 8, 32
+CELLS, CELL_PARTS, CELL_POINTS = 4.0, 8, 32
 #: Noises that are tried first, in that of differences; steps of a level, in noises.
-NOISES, LEVEL_STEP = np.geomspace(0.1, 3.0, 12), 0.5
+TRIED_NOISES, LEVEL_STEP = np.geomspace(0.1, 3.0, 12), 0.5
 #: Shares that are read as another code, and further codes of a dead band on either side.
-SHARES, WIDTHS = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 1.0, 23)]), 12
+MISREAD_SHARES, DEAD_CODES_MOST = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 1.0, 23)]), 12
 #: Times that the commonest value of readings on no lattice is commoner than the next one.
 STANDS_OUT = 3.0
 #: Times that a map is sought at the levels and noises of the last one, and these are refined for one map.
@@ -149,7 +149,7 @@ class Cells:
             self.origin = step * float(np.median(y / step - np.rint(y / step)))
             self.origin *= abs(self.origin) > 0.1 * step
         # A code has an upper and a lower half: that is enough for a cast.
-        self.parts = 2 if self.width < 1.5 * self.step else PARTS
+        self.parts = 2 if self.width < 1.5 * self.step else CELL_PARTS
         code = np.rint((y - self.origin) / self.width).astype(np.int64)
         middle = int(np.quantile(code, 0.5, method="lower"))  # one of them: a mean of two may lie far from all
         self.kept = np.abs(code - middle) < CODES // self.parts
@@ -165,7 +165,7 @@ class Cells:
         self.code = code - self.first
         if self.pile is not None:
             self.code[y[self.kept] == commonest] = self.many - 1
-        self.piece, self.count = counts_of_pieces(self.code, self.many, PIECE, PIECES)
+        self.piece, self.count = counts_of_pieces(self.code, self.many, PIECE_ROWS, LEVEL_PIECES)
         self.total = self.count.sum(axis=0).astype(np.float64)
         self.there = np.flatnonzero(self.total)
         self.edges = self.origin + self.width * (
@@ -176,8 +176,8 @@ class Cells:
     def read(self, map_of: Callable[[Array], Array]) -> csr_matrix:
         """Chance [codes, parts] that a true value is read as a code, by a map of values."""
         many = self.edges.size - 1
-        each = POINTS // self.parts
-        points = self.edges[:-1, None] + self.width * (np.arange(each) + 0.5) / POINTS
+        each = CELL_POINTS // self.parts
+        points = self.edges[:-1, None] + self.width * (np.arange(each) + 0.5) / CELL_POINTS
         code = np.rint((map_of(points) - self.origin) / self.width).astype(np.int64) - self.first
         inside = (code >= 0) & (code < self.many - 1)
         return csr_matrix(
@@ -194,7 +194,7 @@ class Cells:
         low, high = mean.min() - 2.0 * self.noise, mean.max() + 2.0 * self.noise
         if self.folds:
             low, high = min(low, -high), max(high, -low)
-        for sigma in self.noise * NOISES:
+        for sigma in self.noise * TRIED_NOISES:
             level = np.arange(low, high + LEVEL_STEP * sigma, LEVEL_STEP * sigma)
             chances.append((level, np.diff(ndtr((self.edges[:, None] - level) / sigma), axis=0)))
         return chances
@@ -206,7 +206,7 @@ class Cells:
         price = np.outer([0.0, 0.5], np.log(self.count.sum(axis=1)))
         none = _Fit(np.zeros_like(price), np.zeros_like(price), np.full(price.shape, -np.inf))
         best = none if near is None else replace(near, ln=none.ln)
-        for (levels, chance), tried in zip(self.true, self.noise * NOISES, strict=True) if near is None else ():
+        for (levels, chance), tried in zip(self.true, self.noise * TRIED_NOISES, strict=True) if near is None else ():
             ln = count[:, 0].T @ np.log(self._likely(to @ chance))
             level_of = np.broadcast_to(levels[np.argmax(ln, axis=1)], price.shape)
             best = best.better(_Fit(level_of, np.full(level_of.shape, tried), ln.max(axis=1) - price))
@@ -226,7 +226,7 @@ class Cells:
             of_noise[0], noise[0] = of_noise[0].sum(), noise[0].sum()
             step = np.clip(of_noise / noise, -LEVEL_STEP, LEVEL_STEP)
             level = level + sigma * np.clip((score - both * step) / known, -LEVEL_STEP, LEVEL_STEP)
-            sigma = np.clip(sigma * np.exp(step), *self.noise * NOISES[[0, -1]])
+            sigma = np.clip(sigma * np.exp(step), *self.noise * TRIED_NOISES[[0, -1]])
         return best
 
     def _likely(self, chance: Array) -> Array:
@@ -270,7 +270,7 @@ def noise_beside(y: Array) -> tuple[float, int, float]:
     """The commonest of readings [n], how often it comes, and the noise, of the others alone where it is common."""
     unique, counts = np.unique(y, return_counts=True)
     commonest, most = float(unique[np.argmax(counts)]), int(counts.max())
-    return commonest, most, noise_of(y[y != commonest] if most > COMMON * y.size else y)
+    return commonest, most, noise_of(y[y != commonest] if most > COMMON_SHARE * y.size else y)
 
 
 def _about_zero(cells: Cells, y: Array) -> Iterator[_Map]:
@@ -312,14 +312,14 @@ def _of_places(cells: Cells, over: Array, near: _Map | None = None) -> Iterator[
         centre = place if cells.pile is None else round((cells.pile - cells.origin) / cells.width) - cells.first
         off = np.abs(code - centre)
         off[-1] = code.size
-        for inner in range(WIDTHS) if near is None else range(max(0, near.inner - 1), near.inner + 2):
-            for share in SHARES[:: 6 if inner else 2] if near is None else SHARES:
+        for inner in range(DEAD_CODES_MOST) if near is None else range(max(0, near.inner - 1), near.inner + 2):
+            for share in MISREAD_SHARES[:: 6 if inner else 2] if near is None else MISREAD_SHARES:
                 lost = np.where(off <= inner, 1.0, np.where(off == inner + 1, share, 0.0))
                 yield _Map("band", None, lost, place, inner, float(share))
     if "uneven" in kinds and cells.pile is None and cells.width < 1.5 * cells.step:
         for place in (0, 1) if near is None else (near.place,):
             narrow = (code % 2 == place) & (code > 0) & (code < cells.many - 2)
-            for share in SHARES[::2] if near is None else SHARES:
+            for share in MISREAD_SHARES[::2] if near is None else MISREAD_SHARES:
                 yield _Map("uneven", None, share * narrow, place, share=float(share))
 
 

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Mask, Rows
 from selfcal.base.limits import FEWEST_ROWS
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model
 from selfcal.model.tables import GateTable, gate_table, make_tables
 
 
-def table_of(recording: Recording, model: Model, axes: tuple[str, ...]) -> GateTable:
+def gate_of_recording(recording: Recording, model: Model, axes: tuple[str, ...]) -> GateTable:
     """The gate's configuration for the recording's rate. Raises UserError where the model has none for it."""
     table = gate_table(model, make_tables(model, recording.rate_hz, axes))
     if table is None:
@@ -35,9 +36,9 @@ class Learning:
         self.gate = _library32.Gate(*astuple(table))
         self.learn_at = _library32.GATE_MEASURED_MIN
 
-    def push(self, samples: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def push(self, samples: NDArray[np.float32]) -> Mask:
         """Samples [n, axes], not beyond the end of a window; whether each is at rest."""
-        rest: NDArray[np.bool_] = np.frombuffer(self.gate.push(samples), np.uint8) == 1
+        rest: Mask = np.frombuffer(self.gate.push(samples), np.uint8) == 1
         if self.gate.last()["measured"] == 0:
             self.learn_at = _library32.GATE_MEASURED_MIN
         if self.gate.last()["measured"] >= self.learn_at:
@@ -59,7 +60,7 @@ def gated(recording: Recording, model: Model) -> Recording:
     """
     axes = tuple(name for name in model.axes if name in recording.columns and recording.columns[name].clock is None)
     tables = make_tables(model, recording.rate_hz, axes)
-    table = table_of(recording, model, axes)
+    table = gate_of_recording(recording, model, axes)
     samples = np.column_stack([as_float(bridged(recording.in_unit(name, model.group_of(name).unit))) for name in axes])
     samples = np.ascontiguousarray(samples, np.float32)
     used, ended = _resting(samples, recording.missing_before, table)
@@ -77,9 +78,7 @@ def gated(recording: Recording, model: Model) -> Recording:
     return recording.with_rows(used, moving=True)
 
 
-def _resting(
-    samples: NDArray[np.float32], missing_before: NDArray[np.int64], table: GateTable
-) -> tuple[NDArray[np.bool_], list[int]]:
+def _resting(samples: NDArray[np.float32], missing_before: Rows, table: GateTable) -> tuple[Mask, list[int]]:
     """Whether the bank takes each of samples [n, axes]; and rows behind which a gap ended the rest: the interval in
     progress there is dropped."""
     learning = Learning(table)

@@ -22,19 +22,19 @@ from selfcal.readings.budget import nats_of
 #: Share of the rows that repeat beyond chance, at least: fewer change no noise by half a percent.
 SHARE_LEAST = 0.008
 #: Rows that show its line, and the power of the line over the mean in the blocks that follow its phase.
-HEAD, IN_BLOCK = 1 << 17, 60.0
+LINE_ROWS, IN_BLOCK = 1 << 17, 60.0
 #: Share of the rows that repeat, over the beat's frequency, at least: one a beat, and one more for each late row.
 ONE_EACH = 0.75
 #: Share of the rows in whose phase none repeats, at least, and of the repeats that those phases have, at most.
-SMEARED, LEFT = 0.25, 0.35
+SMEARED, REPEATS_LEFT_MOST = 0.25, 0.35
 #: Share of readings that are equal by chance from which on a row may be; rows that repeat at no beat, at most.
-CHANCE, RUN_MOST = 0.01, 5
+EQUAL_SHARE, RUN_MOST = 0.01, 5
 #: Most rows to a reading in a stretch; most stretches; chance of a missing repeat; pseudo-count of equal readings.
-RATIO_MOST, STRETCHES, MISSED, SUPPOSED = 5, 8, 0.02, 2.0
+RATIO_MOST, STRETCHES_MOST, MISSED, SUPPOSED = 5, 8, 0.02, 2.0
 #: Changes of a channel that is read anew each period, at least: a chamber may step a few times, as evenly.
 CHANGES_LEAST = 8
 #: Rows in a bin of the phase, and bins at most.
-IN_BIN, BINS = 50, 100
+IN_BIN, PHASE_BINS_MOST = 50, 100
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Held:
     even: bool = True
 
 
-def held(columns: Sequence[Array], places: Rows, off: Array | None) -> Held | None:
+def held_of(columns: Sequence[Array], places: Rows, off: Array | None) -> Held | None:
     """The part's own readings among rows [n], where the values of all columns [n] are held; None where they are not.
 
     `places` [n]: places of the rows on the logger's grid; `off` [n]: the stamps' distance from it, in intervals.
@@ -68,7 +68,7 @@ def held(columns: Sequence[Array], places: Rows, off: Array | None) -> Held | No
     if of_part is None or of_part is regular:
         return of_part
     # Repeats that stretches of a lower rate explain are theirs.
-    of_stretches = sum(stretch.rows.size for stretch in slower(columns[0]))
+    of_stretches = sum(stretch.rows.size for stretch in slower_stretches(columns[0]))
     return None if 2 * of_stretches > places.size - of_part.rows.size else of_part
 
 
@@ -81,7 +81,7 @@ class Slower:
     nats: float
 
 
-def slower(values: Array) -> list[Slower]:
+def slower_stretches(values: Array) -> list[Slower]:
     """Stretches of readings [n], NaN where there is none, in which the part or the logger ran at a part of its rate.
 
     In a stretch every row but each `ratio`th repeats. A repeat counts by its chance: the share of the readings that
@@ -94,7 +94,7 @@ def slower(values: Array) -> list[Slower]:
     same[1:] = values[1:] == values[:-1]
     chance = max(equal_by_chance(values), 1.0 / n)
     stretches: list[Slower] = []
-    while len(stretches) < STRETCHES:
+    while len(stretches) < STRETCHES_MOST:
         tried = [_slower(same, ratio, chance) for ratio in range(2, RATIO_MOST + 1)]
         best = max(tried, key=lambda stretch: stretch.nats)
         if best.nats < nats_of("held_samples"):
@@ -205,9 +205,9 @@ def _at_a_beat(same: Mask, again: Mask, places: Rows, off: Array | None) -> Held
     if excess < max(SHARE_LEAST, math.sqrt(2.0 * nats_of("held_samples")) * sd):
         return None
     x = np.where(next_one, same - share, 0.0)
-    size = min(n, HEAD)
+    size = min(n, LINE_ROWS)
     head = places[:size] - places[0]
-    if head[-1] > 4 * HEAD:
+    if head[-1] > 4 * LINE_ROWS:
         return None
     grid = np.zeros(next_fast_len(4 * (int(head[-1]) + 1), real=True))
     grid[head] = x[:size]
@@ -227,7 +227,7 @@ def _at_a_beat(same: Mask, again: Mask, places: Rows, off: Array | None) -> Held
         stamped = followed_phase(x, even + off, frequency, block)
         phase = stamped[0] if stamped[1] > size_of_line else phase
     # The share that repeats at each phase: where it is no more than chance the row is a new reading.
-    bins = max(8, min(BINS, n // IN_BIN))
+    bins = max(8, min(PHASE_BINS_MOST, n // IN_BIN))
     bin_of = np.floor((phase % 1.0) * bins).astype(np.int64) % bins
     count = np.bincount(bin_of[next_one], minlength=bins)
     there = np.bincount(bin_of[next_one & same], minlength=bins) / np.maximum(count, 1)
@@ -237,7 +237,7 @@ def _at_a_beat(same: Mask, again: Mask, places: Rows, off: Array | None) -> Held
     if not SMEARED * n < np.count_nonzero(elsewhere) < n - 1:
         return None
     left = float(same[elsewhere].mean()) - chance
-    if not -0.05 * chance - 4.0 * sd < left < LEFT * excess + 3.0 * sd:
+    if not -0.05 * chance - 4.0 * sd < left < REPEATS_LEFT_MOST * excess + 3.0 * sd:
         return None
     rows = np.flatnonzero(~(same & next_one & held_there[bin_of]))
     # A row repeats where the phase passes a whole number: it is as many readings behind the rows.
@@ -245,7 +245,7 @@ def _at_a_beat(same: Mask, again: Mask, places: Rows, off: Array | None) -> Held
     ratio = float(places[rows[-1]] - places[rows[0]]) / float(index[-1] - index[0])
     ahead = np.maximum.accumulate(index - np.arange(rows.size))
     missing = np.diff(ahead, prepend=ahead[0])
-    if chance > CHANCE:
+    if chance > EQUAL_SHARE:
         # The part made a reading more there, and a row was left out: it was equal by chance.
         equal = np.flatnonzero((missing > 0) & (np.diff(rows, prepend=0) > 1))
         missing[equal] -= 1
@@ -261,7 +261,7 @@ def _now_and_then(same: Mask, again: Mask, places: Rows) -> Held | None:
     lengths = np.diff(starts, append=n)
     repeats = same & np.repeat(lengths <= RUN_MOST, lengths)
     share, chance = float(repeats.mean()), float((again & ~same).mean())
-    if share < max(SHARE_LEAST, 10.0 * chance) or chance > CHANCE:
+    if share < max(SHARE_LEAST, 10.0 * chance) or chance > EQUAL_SHARE:
         return None
     expected = max(chance, 1.0 / n)
     nats = n * float(kl_div(share, expected))

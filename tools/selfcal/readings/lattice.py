@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 #: Steps in the noise of a reading (its standard deviation, rounding included) from which on the noise is below the
 #: lattice. A reading that toggles between two values has at least 2, however little noise there was before rounding.
 #: At 1.9 that noise is 0.44 steps and N a fifth too large; below, rounding is white noise of step^2 / 12.
-BELOW_LATTICE = 1.9
+COARSE_FROM = 1.9
 #: Sums that show whether rounding errors are carried on, of a second and of so many readings at least: they scatter by
 #: less than this share of what rounding by itself makes of them. That takes a lattice coarser than COARSEST.
 CARRIED_SUMS, CARRIED_READINGS, CARRIED_SHARE = 120, 8, 0.5
@@ -25,7 +25,7 @@ CARRIED_LEAST = 1e-3
 WHITE_REMAINDERS = 0.1
 #: Values nearer than this share of the largest are one: differences of a counter are rounded so. Those of a float32 are
 #: six times as far apart.
-ROUNDED = 1e-8
+SAME_VALUE_SHARE = 1e-8
 #: Steps in the noise of a reading from which on the lattice is coarser than it. Codes are compared below alone: beyond,
 #: heavy tails look like a dead band, and ln of the counts is not smooth.
 COARSEST = 1.0
@@ -36,7 +36,7 @@ OFF = 0.02
 #: Last digits of printed values in a step at least, for it to show.
 PRINTED = 3.0
 #: Differences between neighbouring values from which on the values of one decade, or of one octave, show their step.
-SHOWN = 20
+STEP_DIFFERENCES_LEAST = 20
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class Lattice:
     @property
     def most(self) -> float:
         """Coarseness beyond which the noise is below the lattice. Of a counter it is: else no remainder would show."""
-        return COARSEST if self.carried else BELOW_LATTICE
+        return COARSEST if self.carried else COARSE_FROM
 
     @property
     def too_coarse(self) -> bool:
@@ -114,7 +114,7 @@ def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
             kind = np.floor(np.log(size) / math.log(base))
         for decade in np.unique(kind[np.isfinite(kind)]):
             for part in (unique[(kind == decade) & (unique > 0.0)], unique[(kind == decade) & (unique < 0.0)]):
-                some = part.size > SHOWN and np.ptp(part) > 0.5 * step  # else one value, rounded
+                some = part.size > STEP_DIFFERENCES_LEAST and np.ptp(part) > 0.5 * step  # else one value, rounded
                 if some and not abs(_step(part) / step - 1.0) < OFF:
                     return False
     return True
@@ -124,11 +124,11 @@ def _step(unique: NDArray[np.floating[Any]]) -> float:
     """The spacing of the lattice that all values lie on, 0 if there is none: the smallest difference between values,
     where every difference is a whole multiple of it; or to the last digit of values that are printed with few."""
     gaps = np.diff(unique)
-    gaps = gaps[gaps > ROUNDED * np.abs(unique).max(initial=0.0)]
+    gaps = gaps[gaps > SAME_VALUE_SHARE * np.abs(unique).max(initial=0.0)]
     if not gaps.size:
         return 0.0
     q, digit = float(gaps.min()), 0.0
-    if unique.size > SHOWN:
+    if unique.size > STEP_DIFFERENCES_LEAST:
         digit = 10.0 ** math.floor(math.log10(q / PRINTED))
         if float(np.abs(unique / digit - np.rint(unique / digit)).max()) > OFF:
             digit = 0.0

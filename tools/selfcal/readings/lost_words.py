@@ -19,10 +19,10 @@ from selfcal.readings.lattice import step_of
 #: Share of wrong readings up to which they are left out.
 #: Of more, either they or the others may be the noise. Then most averages have too few readings too, and a bias that
 #: walks is lost between the others.
-MOST = 0.5
+WRONG_SHARE_MOST = 0.5
 #: Readings of a value whose neighbours are looked at, at most; these on either side, and how far off they may be, in
 #: the noise.
-SAMPLED, AROUND, NEAR = 50_000, 8, 3.0
+SAMPLED, AROUND, NEAR_NOISES = 50_000, 8, 3.0
 #: The others come close to a limit of the part: within this many of their standard deviations, or at the next value,
 #: are this share of its own readings, or of the others. At the largest of some hundred normal readings are fewer.
 CLOSE, CLOSE_OWN, CLOSE_OTHERS = 0.5, 0.5, 0.05
@@ -31,7 +31,7 @@ CLOSE, CLOSE_OWN, CLOSE_OTHERS = 0.5, 0.5, 0.05
 @dataclass(frozen=True)
 class Recurring:
     """Readings that are one `value` too often: their `share`, the `mask` [n] of those to leave out, and the evidence in
-    nats. Beyond a share of MOST none is left out."""
+    nats. Beyond a share of WRONG_SHARE_MOST none is left out."""
 
     value: float
     share: float
@@ -65,7 +65,7 @@ def recurring_of(values: Array, explained: Misread | None) -> Recurring | None:
     if is_limit(others, value, int(own.sum()), spacing) or not _rests(y, own, sigma):
         return None
     share, mask = float(lost.mean()), np.zeros(values.size, bool)
-    if share <= MOST:
+    if share <= WRONG_SHARE_MOST:
         mask[known] = lost
     return Recurring(value, share, mask, min(1e6, nats))
 
@@ -99,7 +99,7 @@ def _rests(y: Array, own: Mask, sigma: float) -> bool:
     first = np.clip(np.searchsorted(others, rows) - AROUND, 0, others.size - 2 * AROUND)
     around = y[others[first[:, None] + np.arange(2 * AROUND)]]
     off = np.abs(around - np.median(around, axis=1, keepdims=True))
-    return bool(np.mean(np.quantile(off, 0.75, axis=1) < NEAR * sigma) >= MOST)
+    return bool(np.mean(np.quantile(off, 0.75, axis=1) < NEAR_NOISES * sigma) >= WRONG_SHARE_MOST)
 
 
 def is_limit(others: Array, value: float, count: int, step: float) -> bool:

@@ -18,16 +18,16 @@ from scipy.special import kl_div, log_ndtr, ndtr, ndtri_exp
 
 from selfcal.base.grid import Array, Mask, Rows, block_means, equal_runs, noise_of, runs
 from selfcal.logs.recording import Recording
-from selfcal.logs.sampling import Change, rate_changes
+from selfcal.logs.sampling import RateChange, rate_changes
 from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
-from selfcal.readings.codes import CHANGED_LEAST, ELSEWHERE, PIECE, PIECES, UNEVEN, Cells, Misread
-from selfcal.readings.held import Held, Slower, held, repeats_of, slower
+from selfcal.readings.changed_words import misread_of, spans_of
+from selfcal.readings.codes import CHANGED_LEAST, ELSEWHERE, LEVEL_PIECES, PIECE_ROWS, UNEVEN, Cells, Misread
+from selfcal.readings.held import Held, Slower, held_of, repeats_of, slower_stretches
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
-from selfcal.readings.lost_words import MOST, Recurring, is_limit, recurring_of
-from selfcal.readings.misread import misread_of, spans_of
-from selfcal.readings.motion import Moved, moves_of
-from selfcal.readings.rest import FEWEST
+from selfcal.readings.lost_words import WRONG_SHARE_MOST, Recurring, is_limit, recurring_of
+from selfcal.readings.moves import Moved, moves_of
+from selfcal.readings.rest import PIECES_LEAST
 
 #: Rows of a recording whose readings are kept once they were looked at, at most.
 KEPT_MOST = 1 << 22
@@ -39,12 +39,12 @@ LN_STUCK = -nats_of("stuck")
 #: the noise chance is not well known.
 HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 1.5, 0.8
 #: Share of an unclipped reading's information below which a clipped one is ignored.
-INFORMATION_LEAST = 0.05
+CLIPPED_SHARE_LEAST = 0.05
 #: Share of the variance of an axis' steps that its copy of another leaves at most: that of a float's digits; and that
 #: of rounding to a lattice, over the variance of as many even steps.
-SAME, ROUNDING, LIKE = 1e-7, 1.4, 0.1
+FLOAT_COPY, LATTICE_COPY, LIKE = 1e-7, 1.4, 0.1
 #: Steps of EM at most, and the change of the noise at which it has settled.
-ITERATIONS, SETTLED = 200, 1e-6
+EM_STEPS_MOST, EM_SETTLED = 200, 1e-6
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Clipped:
 
 
 #: A model file has a range to six digits: readings at the limit that it states may lie so much beyond.
-ROUNDED = 1e-5
+RANGE_ROUNDED = 1e-5
 #: Share of readings beyond the range from which on they count as clipped, and noises to the range at most: the noise of
 #: the others is too small.
 BEYOND_MOST, BEYOND_SD = 0.01, 8.0
@@ -97,7 +97,7 @@ class Readings:
     moved: Moved | None = None
     kept_out: Mapping[str, int] = field(default_factory=dict)
     held: Held | None = None
-    changes: tuple[Change, ...] = ()
+    changes: tuple[RateChange, ...] = ()
     slower: tuple[Slower, ...] = ()
 
     def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
@@ -146,14 +146,14 @@ def look(recording: Recording, axis: str, group: Group) -> Readings:
 
 def within(values: NDArray[np.floating[Any]], group: Group) -> Mask:
     """Which readings [n] are no farther than the range of the part."""
-    return np.asarray(np.abs(values) <= (group.range * (1.0 + ROUNDED) if group.range > 0.0 else math.inf))
+    return np.asarray(np.abs(values) <= (group.range * (1.0 + RANGE_ROUNDED) if group.range > 0.0 else math.inf))
 
 
 def mostly_beyond(values: NDArray[np.floating[Any]], group: Group) -> str:
     """What to say where most readings [n] lie beyond the range: then the others are none either. Empty elsewhere."""
     there = _known(values)
     share = 1.0 - float(within(there, group).mean()) if there.size else 0.0
-    if share <= MOST:
+    if share <= WRONG_SHARE_MOST:
         return ""
     said = f"{100.0 * share:.0f} % of the readings are beyond the range of {group.range:g} {group.unit}: is the unit "
     return f"{said}right, or are words of the log swapped or lost?"
@@ -258,7 +258,7 @@ def _known(values: NDArray[Any]) -> NDArray[Any]:
 # ------------------------------------------------------------------------------------------------------ change of rate
 
 
-def evened(recording: Recording) -> tuple[Recording, tuple[Change, ...]]:
+def evened(recording: Recording) -> tuple[Recording, tuple[RateChange, ...]]:
     """The recording on one even grid, where its rate changes: means over an interval that all rates share."""
     off = recording.off_grid_s
     if off is None:
@@ -358,7 +358,7 @@ def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
     off = recording.off_grid_s
     places = recording.clock.place
     values = [recording.columns[name].values for name in axes]
-    return held(values, places, None if off is None else off * recording.rate_hz)
+    return held_of(values, places, None if off is None else off * recording.rate_hz)
 
 
 # ------------------------------------------------------------------------------------------------------- stuck readings
@@ -367,11 +367,11 @@ def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
 def _repeated(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, float, tuple[Slower, ...]]:
     """Stuck readings [n], their nats, and the stretches of a lower rate. Repeats belong to the likelier of the two."""
     stuck, nats = _stuck(values, lattice, stated)
-    stretches = slower(values)
+    stretches = slower_stretches(values)
     if sum(stretch.nats for stretch in stretches) > nats:
         stuck, nats = _stuck(np.where(repeats_of(stretches, values.size), np.nan, values), lattice, stated)
     elif stuck.any():
-        stretches = slower(np.where(stuck, np.nan, values))
+        stretches = slower_stretches(np.where(stuck, np.nan, values))
     return stuck, nats, tuple(stretches)
 
 
@@ -381,7 +381,7 @@ def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]
     By chance a code of the share p of its piece of the record makes n (1 - p) p^k runs longer than k: a run is worth
     -k ln p. A dependence of neighbours raises every p alike: as much as runs of two and of three readings say."""
     n, none = values.size, np.zeros(values.size, bool)
-    size = max(PIECE, -(-n // PIECES))
+    size = max(PIECE_ROWS, -(-n // LEVEL_PIECES))
     long = lengths > 2
     if not long.any() or n < 2 * size:
         return none, 0.0
@@ -474,7 +474,7 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
         return None
     y, step = _known(values), 0.0 if lattice is None else lattice.step
     sides = []
-    for side, edge in ((1, float(y.max())), (-1, float(y.min()))) if y.size >= 2 * PIECE else ():
+    for side, edge in ((1, float(y.max())), (-1, float(y.min()))) if y.size >= 2 * PIECE_ROWS else ():
         at_edge = np.abs(values - edge) <= max(1e-9 * max(1.0, abs(edge)), 0.25 * step)
         others, count = values[np.isfinite(values) & ~at_edge], int(at_edge.sum())
         if count < CHANGED_LEAST or not (others.size and np.ptp(others) > 0.0):
@@ -516,7 +516,7 @@ def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tupl
     level = _smooth(y, window)
     sigma = float((y - level).std())
     score, information = y, y
-    for _ in range(ITERATIONS):
+    for _ in range(EM_STEPS_MOST):
         # Where there is no limit, one beyond all normal readings has no part in the sums.
         up = np.clip((high - level) / sigma, -4.0, 37.0)
         down = np.clip((low - level) / sigma, -37.0, 4.0)
@@ -526,14 +526,14 @@ def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tupl
         score = np.where(at_upper, above, np.where(at_lower, -below, u))
         second = np.where(at_upper, 1.0 + up * above, np.where(at_lower, 1.0 - down * below, u * u))
         information = ndtr(up) - ndtr(down) - up * p + down * q + p * above + q * below
-        known = np.maximum(_smooth(information, window), INFORMATION_LEAST)
+        known = np.maximum(_smooth(information, window), CLIPPED_SHARE_LEAST)
         level = _smooth(information * level + sigma * score, window) / known
         level = np.clip(level, low - 4.0 * sigma, high + 4.0 * sigma)
         before, sigma = sigma, sigma * math.sqrt(float(second.mean()))
-        if abs(sigma / before - 1.0) < SETTLED:
+        if abs(sigma / before - 1.0) < EM_SETTLED:
             break
-    score = np.where(information < INFORMATION_LEAST, 0.0, score)
-    total = np.cumsum(np.where(information < INFORMATION_LEAST, 0.0, information))
+    score = np.where(information < CLIPPED_SHARE_LEAST, 0.0, score)
+    total = np.cumsum(np.where(information < CLIPPED_SHARE_LEAST, 0.0, information))
     last = np.flatnonzero(np.floor(total) > np.floor(np.concatenate([[0.0], total[:-1]])))
     sums = np.diff(np.concatenate([[0.0], np.cumsum(score)[last]]))
     working = np.full(values.size, np.nan)
@@ -557,9 +557,9 @@ def _smooth(values: Array, window: int) -> Array:
 def _quiet_window(y: Array) -> int:
     """Readings over which the mean of a record [n] is quietest: the averaging length of the least Allan variance. It is
     all of them where the longest that the record shows is the best."""
-    best, least, length = PIECE, math.inf, PIECE
+    best, least, length = PIECE_ROWS, math.inf, PIECE_ROWS
     means = block_means(y, length)
-    while means.size >= FEWEST:
+    while means.size >= PIECES_LEAST:
         variance = 0.5 * float((np.diff(means) ** 2).mean())
         if variance < least:
             best, least = length, variance
@@ -580,13 +580,13 @@ def copied(recording: Recording, name: str, others: Sequence[str]) -> str:
             continue
         both = np.isfinite(own) & np.isfinite(theirs)
         a, b = own[both], theirs[both]
-        if both.sum() < PIECES or not (a.any() and b.any()):
+        if both.sum() < LEVEL_PIECES or not (a.any() and b.any()):
             continue
         factor = float(np.dot(a, b)) / float(np.dot(b, b))
         left, size = float(np.mean((a - factor * b) ** 2)), float(np.mean(a**2))
         if left < LIKE * size:
             steps = (step_of(recording.columns[column].values)[0] for column in (name, other))
-            left -= ROUNDING / 6.0 * float(np.dot(np.square([*steps]), (1.0, factor**2)))
-        if left <= SAME * size:
+            left -= LATTICE_COPY / 6.0 * float(np.dot(np.square([*steps]), (1.0, factor**2)))
+        if left <= FLOAT_COPY * size:
             return f"its readings are those of {other}, but for a factor and an offset: which column is {name}?"
     return ""

@@ -17,12 +17,12 @@ from selfcal.model.file import Model
 from selfcal.model.tables import bank_block
 from selfcal.readings.budget import CHECK_LIMIT
 from selfcal.readings.lattice import step_of
-from selfcal.readings.motion import PUSH
+from selfcal.readings.moves import PUSH
 
 #: Length of a piece, s, and its samples at least.
-PIECE_S, PIECE_LEAST = 1.0, 4
+LEVEL_PIECE_S, PIECE_LEAST = 1.0, 4
 #: Fewest pieces, or differences of neighbouring means, that show a deviation.
-FEWEST = 8
+PIECES_LEAST = 8
 #: Share of the quietest pieces that rest is known from: a recording may move for most of its time.
 QUIET_SHARE = 0.2
 #: Probability that a piece of normal noise is called motion, and a factor for noise that is not normal.
@@ -30,7 +30,7 @@ LOUD_P, LOUD_MARGIN = 1e-7, 1.5
 
 
 @dataclass(frozen=True)
-class Rest:
+class RestStretches:
     """Stretches of motion and of rest, s of the recording; none where the recording is too short."""
 
     moved: tuple[tuple[float, float], ...]
@@ -42,14 +42,14 @@ class Rest:
         return max(self.still, key=lambda run: run[1] - run[0], default=None)
 
 
-def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
+def rest_of(recording: Recording, axes: Sequence[str]) -> RestStretches:
     """When the sensor moved, by the scatter within pieces of 1 s and the jumps between their means, each against those
     of the recording's quietest fifth. An axis alone counts. A change by one step of its lattice is no motion."""
-    piece = max(PIECE_LEAST, round(PIECE_S * recording.rate_hz))
+    piece = max(PIECE_LEAST, round(LEVEL_PIECE_S * recording.rate_hz))
     place = recording.clock.place - recording.clock.place[0]
     index, count = place // piece, int(place[-1] + 1) // piece  # of whole pieces
-    if not FEWEST <= count <= recording.samples:
-        return Rest((), ())
+    if not PIECES_LEAST <= count <= recording.samples:
+        return RestStretches((), ())
     kept = index < count
     used = np.bincount(index[kept], minlength=count)
     whole = used == piece
@@ -75,7 +75,7 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
     moved, still = (
         tuple((start + a * length_s, start + b * length_s) for a, b in runs(mask)) for mask in (moving, ~moving)
     )
-    return Rest(moved, still)
+    return RestStretches(moved, still)
 
 
 def outside_priors(recording: Recording, model: Model, axes: Sequence[str]) -> str:

@@ -11,8 +11,8 @@ import numpy as np
 
 from selfcal.adequacy.overbound import upper_limit
 from selfcal.base import units
-from selfcal.base.errors import UserError, printable
-from selfcal.base.output import plotter, save_picture
+from selfcal.base.errors import UserError
+from selfcal.show.plots import log_log, name_of, plotter, save_picture
 
 #: Colours of the model and of points outside it.
 MODEL, OUTSIDE = "tab:blue", "tab:red"
@@ -47,9 +47,8 @@ def figure_of(document: Mapping[str, Any], *, datasheet: bool = False) -> Any:
     outside = [name for name, axis in axes.items() if not axis["adequate"]]
     recording = document["recording"]
     verdict = f"not adequate: {', '.join(outside)}" if outside else "every axis is adequate"
-    name = printable(Path(recording["path"]).name)
     figure.suptitle(
-        f"{name}, {recording['rate_hz']:g} Hz, {recording['duration_s']:g} s: {verdict}",
+        f"{name_of(recording)}, {recording['rate_hz']:g} Hz, {recording['duration_s']:g} s: {verdict}",
         fontweight="bold",
         color=OUTSIDE if outside else "black",
         parse_math=False,
@@ -92,8 +91,7 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
     panel.errorbar(
         samples["tau_s"], curve, error, color="black", marker="o", markersize=3.5, linewidth=1, elinewidth=1, capsize=2
     )
-    panel.set_xscale("log")
-    panel.set_yscale("log")
+    log_log(panel)
     heights = np.concatenate([curve, scaled(allan, "model")])
     panel.set_ylim(0.4 * heights.min(), 1.5 * heights.max())
     if samples["tau_s"][0] < 0.99 * tau[0]:
@@ -133,7 +131,6 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
     panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     panel.yaxis.set_minor_formatter(NullFormatter())
-    panel.grid(True, which="major", alpha=0.3)
 
 
 def _of_means(allan: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,10 +12,9 @@ from typing import Literal
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
-from selfcal.base.grid import Array, Mask, runs
-from selfcal.show.template import number, render
+from selfcal.base.grid import Array, Mask, Rows, runs
+from selfcal.show.page_template import number, render
 
 #: Size of a panel and of its margins, in units of the picture: text of 12 units stays legible on a telephone.
 WIDTH, HEIGHT = 340, 220
@@ -23,9 +22,9 @@ LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 #: Size of a picture of strips, room for their names, and the height of each.
 STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
 #: Most points of a curve.
-POINTS = 400
+POINTS_MOST = 400
 #: Most rows of a table behind a picture.
-ROWS = 25
+TABLE_ROWS_MOST = 25
 #: Approximate number of ticks of an axis.
 TICKS = 5
 
@@ -112,7 +111,7 @@ class Panel:
             else:
                 same[1].extend(columns)
         for x, columns in groups:
-            every = max(1, math.ceil(x.size / ROWS))
+            every = max(1, math.ceil(x.size / TABLE_ROWS_MOST))
             thinned = "" if every == 1 else f" One point in {every} of {x.size}."
             heads = [self.x_label, *(label for label, _ in columns)]
             rows = (
@@ -142,7 +141,7 @@ class Figure:
         return looks
 
 
-def means_of(edges: NDArray[np.int64], values: Array | Mask) -> Array:
+def means_of(edges: Rows, values: Array | Mask) -> Array:
     """Mean of the finite values in each piece between `edges`; NaN without any."""
     good = np.isfinite(values)
     with np.errstate(invalid="ignore", divide="ignore"):

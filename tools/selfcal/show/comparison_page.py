@@ -15,15 +15,15 @@ from markupsafe import Markup
 from selfcal.base.errors import short
 from selfcal.base.units import typeset
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw
-from selfcal.show.template import render
+from selfcal.show.page_template import render
 
 #: Allan deviations by axis and recording: the key `allan` of `selfcal.identify/1`.
 Curves = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 
-def page(document: Mapping[str, Any], curves: Curves) -> str:
+def comparison_html(document: Mapping[str, Any], curves: Curves) -> str:
     """The page of a document `selfcal.compare/1`."""
-    names = names_of(document)
+    names = short_names(document)
     axes = [_axis(name, entry, document, curves.get(name, {}), names) for name, entry in document["axes"].items()]
     title = f"Comparison of {' and '.join(names.values())}"
     one_in = round(1.0 / math.erfc(document["limit_sd"] / math.sqrt(2.0)))
@@ -64,7 +64,7 @@ class Told:
         return ", ".join(f"{size:.{digits}g}{unit}" for size, unit in zip(sizes, units, strict=True))
 
 
-def names_of(document: Mapping[str, Any]) -> dict[str, str]:
+def short_names(document: Mapping[str, Any]) -> dict[str, str]:
     """The recordings by their file names; by whole paths where two names are equal."""
     logs = document["recordings"]
     short = [Path(log).name for log in logs]

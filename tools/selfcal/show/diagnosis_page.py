@@ -27,8 +27,8 @@ from selfcal.diagnosis.response import RECORDS
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.show import chart, pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outside_of, strips
-from selfcal.show.findings import before_after, notes
-from selfcal.show.template import number, render
+from selfcal.show.diagnosis_lines import before_after, notes
+from selfcal.show.page_template import number, render
 
 #: The line in place of a picture.
 LEFT_OUT = Markup(
@@ -44,7 +44,7 @@ Options = Sequence[tuple[str, str]]
 Entry = Mapping[str, Any]
 
 
-def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], options: Options = ()) -> str:
+def diagnosis_html(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], options: Options = ()) -> str:
     """The page. Numbers and words are the document's (selfcal.diagnose/1); pictures are made from `record` and
     `diagnosed`.
     `options`: how the recording was read and looked at, for the commands that reproduce it.
@@ -228,7 +228,7 @@ def _readings(findings: Sequence[Entry], axes: Sequence[_Axis]) -> Markup:
     for axis in axes:
         unit, record, state = str(axis.entry["unit"]), axis.diagnosed.record, axis.diagnosed.first
         factor = units.factor(axis.diagnosed.state.unit, unit)
-        x, mean, low, high = envelope(record.time_s + record.start_s, state.y, chart.POINTS)
+        x, mean, low, high = envelope(record.time_s + record.start_s, state.y, chart.POINTS_MOST)
         bands = [Band("lowest to highest reading", x, factor * low, factor * high, "spread")]
         bands += _moving(record, axis.name, factor, state.level)
         curve = Curve("mean", x, factor * mean)
@@ -249,7 +249,7 @@ def _moving(record: Record, name: str, factor: float, level: float) -> list[Band
     if read is None or not read.moving.any():
         return []
     values = np.where(read.moving, read.values - level, np.nan)
-    x, _, low, high = envelope(read.recording.time_s + read.recording.start_s, values, chart.POINTS)
+    x, _, low, high = envelope(read.recording.time_s + read.recording.start_s, values, chart.POINTS_MOST)
     return [Band("moving, left out", x, factor * low, factor * high, "moving")]
 
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from selfcal.adequacy.overbound import overbound, upper_limit
-from selfcal.bank.result import likeliest
+from selfcal.bank.axis_result import likeliest
 from selfcal.base import units
+from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError, remark
 from selfcal.base.output import write_text
-from selfcal.base.templates import of_code
 
 #: Names of the formats on the command line, and their templates.
 FORMS = {
@@ -39,7 +39,7 @@ PREDICT_S = 0.01
 
 
 @dataclass(frozen=True)
-class Kind:
+class SensorKind:
     """The gyros (rad/s) or the accelerometers (m/s^2): medians of the worst axes, and the overbound of all.
 
     `bounded`: the overbound is written and the medians are the comment; `notes`: what the file says of the kind.
@@ -90,14 +90,14 @@ def write_export(
     write_text(path, text_of(form, gyro, accel, document["recording"]))
 
 
-def text_of(form: str, gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
+def text_of(form: str, gyro: SensorKind, accel: SensorKind, recording: Mapping[str, Any]) -> str:
     """The file of one of FORMS."""
     template = of_code(Path(__file__).parent / "templates" / "export").get_template(f"{FORMS[form]}.jinja")
     values = {"gyro": gyro, "accel": accel, "recording": recording, "PREDICT_S": PREDICT_S}
     return template.render(head=_head(gyro, accel, recording), **values)
 
 
-def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:
+def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> SensorKind:
     axes = {
         name: axis
         for name, axis in document["axes"].items()
@@ -109,7 +109,7 @@ def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:
 
     def median(name: str, law: str, parameter: str) -> float:
         entry = axes[name]["parameters"][law][parameter]
-        return units.convert(float(entry["median"]), entry["unit"], units.parameter_unit(parameter, unit))
+        return units.converted(float(entry["median"]), entry["unit"], units.parameter_unit(parameter, unit))
 
     def worst(law: str, parameter: str) -> str:
         return str(max(axes, key=lambda name: median(name, law, parameter)))
@@ -147,10 +147,10 @@ def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:
             f"{what}: the overbound lies above the Allan deviation of each axis, at its upper {level or OVERBOUND:g} "
             f"limit, from {min(t[0] for t in tau):g} to {max(t[-1] for t in tau):g} s"
         )
-    return Kind(medians, {"N": n, "K": k}, level or OVERBOUND, level is not None, tuple(notes))
+    return SensorKind(medians, {"N": n, "K": k}, level or OVERBOUND, level is not None, tuple(notes))
 
 
-def _head(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> list[str]:
+def _head(gyro: SensorKind, accel: SensorKind, recording: Mapping[str, Any]) -> list[str]:
     """The lines of the comment that a file begins with."""
     return [
         f"Made by `selfcal identify --export` from {remark(Path(recording['path']).name)}: "

@@ -11,17 +11,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from selfcal.adequacy.document import as_typed
+from selfcal.adequacy.identify_document import as_typed
 from selfcal.adequacy.summary import MOST_TIMES, noisier
+from selfcal.bank.axis_result import LAW_LEAST, likeliest
 from selfcal.bank.priors import OF_RECORD
-from selfcal.bank.result import FAINT, likeliest
 from selfcal.base import units
 from selfcal.base.errors import called, few, printable
 from selfcal.base.output import TABLE_WIDTH, console_of, print_line, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
-from selfcal.readings.misread import MISREAD
-from selfcal.readings.motion import events_of
+from selfcal.readings.changed_words import MISREAD
+from selfcal.readings.moves import motion_events
 
 Reason = TypeVar("Reason", str, tuple[str, str])
 #: A check, its axes, and their outcomes.
@@ -47,7 +47,7 @@ def show(
     summary = fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
     laws = fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
     first = summary if numbered else laws
-    first.title = escape(heading(document["recording"]))
+    first.title = escape(recording_heading(document["recording"]))
     if numbered:
         console.print(summary)
     console.print(laws)
@@ -57,7 +57,7 @@ def show(
         print_line(console, line)
 
 
-def heading(recording: Mapping[str, Any]) -> str:
+def recording_heading(recording: Mapping[str, Any]) -> str:
     """A recording's name and extent, and where a stretch of it begins."""
     start = f" from {recording['start_s']:g} s on" if recording.get("start_s") else ""
     extent = f"{recording['samples']} samples, {recording['rate_hz']:g} Hz, {recording['duration_s']:g} s"
@@ -248,7 +248,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         coarse = [
             law
             for law, parameters in axis["parameters"].items()
-            if axis["hypotheses"][law] >= FAINT and any(e["off_grid"] for e in parameters.values())
+            if axis["hypotheses"][law] >= LAW_LEAST and any(e["off_grid"] for e in parameters.values())
         ]
         if coarse:
             failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
@@ -260,7 +260,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         of = _by_reason((named(why), name) for name, why in suspicions.items() if ("added_law" in axes[name]) is chosen)
         failed += [f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in of.items())}"] if of else []
     more = _by_reason(
-        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > FAINT), name)
+        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > LAW_LEAST), name)
         for name, more in ((name, axis["more_laws"]) for name, axis in axes.items() if "more_laws" in axis)
     )
     failed += [f"with the laws of sums.yaml: {names}: {laws}" for laws, names in more.items()]
@@ -294,7 +294,9 @@ def _events(axes: Mapping[str, Any], *, passed: bool) -> list[_Event]:
             same[1].append(name)
             same[2].append(outcome)
     for check, outcomes in lasting.items():
-        for names, intervals in events_of({name: outcome["intervals"] for name, outcome in outcomes.items()}).items():
+        for names, intervals in motion_events(
+            {name: outcome["intervals"] for name, outcome in outcomes.items()}
+        ).items():
             events.append((check, [*names], [{**outcomes[names[0]], "intervals": intervals}]))
     return events
 

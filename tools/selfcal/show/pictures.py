@@ -10,26 +10,25 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import detrend
 
-from selfcal.base.grid import runs
+from selfcal.base.grid import Array, Rows, runs
 from selfcal.diagnosis.causes import CAUSES, shared
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.response import RECORDS
-from selfcal.diagnosis.statistics import Indices, allan_deviation, simulated, whitened_of
+from selfcal.diagnosis.statistics import allan_deviation, simulated, whitened_of
 from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
-from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope, means_of
+from selfcal.show.chart import POINTS_MOST, Band, Curve, Figure, Panel, envelope, means_of
 
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
-LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
+LAGS_SHOWN, PIECES_SHOWN, HISTOGRAM_BINS, BINS_SHOWN = 30, 60, 61, 60
 
 Summary = Callable[[Array, Array], Array]
 
 
 @dataclass(frozen=True)
-class Compared:
+class BeforeAfter:
     """A curve of a record and the band of the same curve in simulated records, before and after.
 
     `summary(y, w)` makes the curve [x.size] of readings y [n] and their residual innovations w [n]. It may differ
@@ -70,19 +69,19 @@ def figures(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> t
         ]
         for finding in diagnosed.findings
     ]
-    compared = [*overview, *(item for plan in plans for item in plan if isinstance(item, Compared))]
+    compared = [*overview, *(item for plan in plans for item in plan if isinstance(item, BeforeAfter))]
     pairs = _ensembles(compared)
 
-    def figure(item: Compared | Figure) -> Figure:
+    def figure(item: BeforeAfter | Figure) -> Figure:
         return item if isinstance(item, Figure) else _figure(item, pairs)
 
     sides = _sides(diagnosed, record, factor, unit)
     return [sides, *(figure(item) for item in overview)], [[figure(item) for item in plan] for plan in plans]
 
 
-def _ensembles(items: Sequence[Compared]) -> _Pairs:
+def _ensembles(items: Sequence[BeforeAfter]) -> _Pairs:
     """Every band. Each state is simulated once for all the pictures that need it: with a record in memory at a time."""
-    jobs: dict[int, tuple[State, list[tuple[int, Compared]]]] = {}
+    jobs: dict[int, tuple[State, list[tuple[int, BeforeAfter]]]] = {}
     for item in items:
         for side, state in enumerate(item.states):
             jobs.setdefault(id(state), (state, []))[1].append((side, item))
@@ -102,7 +101,7 @@ def _ensembles(items: Sequence[Compared]) -> _Pairs:
     return pairs
 
 
-def _figure(item: Compared, pairs: _Pairs) -> Figure:
+def _figure(item: BeforeAfter, pairs: _Pairs) -> Figure:
     panels = []
     same = item.states[0] is item.states[1]
     for side, title in enumerate(("Model as it is",) if same else ("Before", "After")):
@@ -123,7 +122,7 @@ def _figure(item: Compared, pairs: _Pairs) -> Figure:
     return Figure(item.name, item.caption, panels)
 
 
-def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> Compared | Figure:
+def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> BeforeAfter | Figure:
     """The picture of the statistic that shows the finding."""
     name, state = finding.look.shown_by, finding.before
     if "allan" in name:
@@ -143,7 +142,7 @@ def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> 
     return _histogram_of_readings((finding.before, finding.after), "How often each reading comes.", factor, unit)
 
 
-def _allan(before: State, after: State, factor: float, unit: str) -> Compared:
+def _allan(before: State, after: State, factor: float, unit: str) -> BeforeAfter:
     n = before.y.size
     most = max(2, n // 6)
     count = max(2, round(8 * math.log10(most)) + 1)
@@ -152,7 +151,7 @@ def _allan(before: State, after: State, factor: float, unit: str) -> Compared:
     def summary(y: Array, w: Array) -> Array:
         return factor * allan_deviation(y, sizes)
 
-    return Compared(
+    return BeforeAfter(
         "Allan deviation",
         "A slope of −1/2 is white noise, +1/2 a random walk, level ground flicker.",
         "averaging time, s",
@@ -174,7 +173,7 @@ def _power(y: Array, dt: float) -> tuple[Array, Array]:
     return rfftfreq(x.size, dt), power
 
 
-def _spectrum(before: State, after: State, factor: float, unit: str) -> Compared:
+def _spectrum(before: State, after: State, factor: float, unit: str) -> BeforeAfter:
     n, dt = before.y.size, before.dt
     frequency = rfftfreq(n, dt)
     first = min(3, frequency.size - 2)
@@ -187,7 +186,7 @@ def _spectrum(before: State, after: State, factor: float, unit: str) -> Compared
     def summary(y: Array, w: Array) -> Array:
         return factor * np.sqrt(np.add.reduceat(_power(y, dt)[1], edges) / size)
 
-    return Compared(
+    return BeforeAfter(
         "Spectrum",
         "Level ground is the white noise density N.",
         "frequency, Hz",
@@ -201,19 +200,19 @@ def _spectrum(before: State, after: State, factor: float, unit: str) -> Compared
     )
 
 
-def _line(finding: Finding, factor: float, unit: str) -> Compared:
+def _line(finding: Finding, factor: float, unit: str) -> BeforeAfter:
     """The spectrum close to a line."""
     state = finding.before
     f = float(finding.look.estimate["frequency_hz"]["median"])
     frequency = rfftfreq(state.y.size, state.dt)
     nearest = int(np.argmin(np.abs(frequency - f)))
-    low, high = max(1, nearest - BESIDE), min(frequency.size, nearest + BESIDE + 1)
+    low, high = max(1, nearest - BINS_SHOWN), min(frequency.size, nearest + BINS_SHOWN + 1)
 
     def removed(state: State) -> Summary:
         effect = _effect(finding) if state is finding.after else np.zeros(state.y.size)
         return lambda y, w: factor * np.sqrt(_power(y - effect, state.dt)[1][low:high])
 
-    return Compared(
+    return BeforeAfter(
         "Spectrum about the line",
         "After: the fitted line is subtracted from measured and simulated readings.",
         "frequency, Hz",
@@ -226,8 +225,8 @@ def _line(finding: Finding, factor: float, unit: str) -> Compared:
     )
 
 
-def _correlation(before: State, after: State, magnitude: bool = False) -> Compared:
-    lags = min(LAGS, before.y.size // 4)
+def _correlation(before: State, after: State, magnitude: bool = False) -> BeforeAfter:
+    lags = min(LAGS_SHOWN, before.y.size // 4)
 
     def summary(y: Array, w: Array) -> Array:
         x = np.minimum(np.abs(w), 3.5) if magnitude else w
@@ -237,7 +236,7 @@ def _correlation(before: State, after: State, magnitude: bool = False) -> Compar
         return np.asarray(product[1:] / product[0])
 
     what = "magnitudes of the residual innovations" if magnitude else "residual innovations"
-    return Compared(
+    return BeforeAfter(
         f"Correlation of the {what}",
         "A model that fits leaves no correlation between prediction errors.",
         "lag, samples",
@@ -249,15 +248,15 @@ def _correlation(before: State, after: State, magnitude: bool = False) -> Compar
     )
 
 
-def _pieces(record: Record, count: int) -> tuple[Indices, Array]:
+def _pieces(record: Record, count: int) -> tuple[Rows, Array]:
     n = record.present.size
     edges = np.unique(np.linspace(0, n, min(count, max(1, n // 10)) + 1).astype(int))
     return edges, 0.5 * (edges[:-1] + edges[1:]) / record.rate_hz
 
 
 def _level(
-    finding: Finding, record: Record, means: bool = False, marked: bool = False, pieces: int = PIECES
-) -> Compared:
+    finding: Finding, record: Record, means: bool = False, marked: bool = False, pieces: int = PIECES_SHOWN
+) -> BeforeAfter:
     edges, middle = _pieces(record, pieces)
     size = np.sqrt(np.diff(edges))
 
@@ -265,7 +264,7 @@ def _level(
         return means_of(edges, w) * size if means else np.sqrt(means_of(edges, w * w))
 
     what = "Mean" if means else "Noise level"
-    return Compared(
+    return BeforeAfter(
         f"{what} of the residual innovations",
         f"{what} of the prediction errors in {edges.size - 1} pieces of the record, in units of the expected one.",
         "time, s",
@@ -277,14 +276,14 @@ def _level(
     )
 
 
-def _largest(finding: Finding, record: Record) -> Compared:
-    edges, middle = _pieces(record, POINTS // 2)
+def _largest(finding: Finding, record: Record) -> BeforeAfter:
+    edges, middle = _pieces(record, POINTS_MOST // 2)
 
     def summary(y: Array, w: Array) -> Array:
         largest = np.maximum.reduceat(np.where(np.isfinite(w), np.abs(w), -1.0), edges[:-1])
         return np.asarray(np.where(largest < 0.0, np.nan, largest))
 
-    return Compared(
+    return BeforeAfter(
         "Largest residual innovations",
         f"The largest prediction error in each of {edges.size - 1} pieces of the record. Gaps: samples kept out.",
         "time, s",
@@ -295,14 +294,14 @@ def _largest(finding: Finding, record: Record) -> Compared:
     )
 
 
-def _histogram(before: State, after: State) -> Compared:
-    edges = np.linspace(-8.0, 8.0, BINS + 1)
+def _histogram(before: State, after: State) -> BeforeAfter:
+    edges = np.linspace(-8.0, 8.0, HISTOGRAM_BINS + 1)
 
     def summary(y: Array, w: Array) -> Array:
         counts = np.histogram(np.clip(w[np.isfinite(w)], -7.999, 7.999), edges)[0]
         return np.asarray(np.log10(np.maximum(counts, 0.3)))
 
-    return Compared(
+    return BeforeAfter(
         "Histogram of the residual innovations",
         "Prediction errors over their expected sd; those beyond 8 are counted at 8. The lowest line is an empty bin.",
         "size over the expected sd",
@@ -314,13 +313,13 @@ def _histogram(before: State, after: State) -> Compared:
     )
 
 
-def _lattice(finding: Finding, factor: float, unit: str) -> Compared:
+def _lattice(finding: Finding, factor: float, unit: str) -> BeforeAfter:
     """Histogram of the readings; before, the model reads out on no lattice."""
     free = replace(finding.before, lsb=0.0)
     return _histogram_of_readings((free, finding.after), "Before: without a lattice.", factor, unit, finding.before.lsb)
 
 
-def _limit(finding: Finding, factor: float, unit: str) -> Compared:
+def _limit(finding: Finding, factor: float, unit: str) -> BeforeAfter:
     """Histogram of the readings; before, the model reads out without a limit."""
     before = finding.before
     # The state after saturation holds clipped readings drawn anew: the readings are the record's own.
@@ -331,25 +330,25 @@ def _limit(finding: Finding, factor: float, unit: str) -> Compared:
 
 def _histogram_of_readings(
     states: tuple[State, State], caption: str, factor: float, unit: str, lattice: float = 0.0, edge: float = math.inf
-) -> Compared:
+) -> BeforeAfter:
     """`lattice`: of the readings where it is to be seen; `edge`: the limit, less the level, that clips them after."""
     before, after = states
     y = before.y[np.isfinite(before.y)]
     sigma, lsb = before.best.sigma, max(before.lsb, lattice)
     low, high = float(y.min()), float(y.max())
-    if high - low > 0.5 * BINS * max(lsb, 0.2 * sigma):
+    if high - low > 0.5 * HISTOGRAM_BINS * max(lsb, 0.2 * sigma):
         low, high = (float(value) for value in np.quantile(y, [0.001, 0.999]))
     if math.isfinite(edge):
         low, high = min(low, edge), max(high, edge)
     low, high = low - 0.5 * sigma - lsb, high + 0.5 * sigma + lsb
     if lsb > 0.0:
         # Whole codes a bin, about each code; four bins a code show that the readings lie on the codes alone.
-        codes = max(1, math.ceil((high - low) / lsb / (2 * BINS)))
+        codes = max(1, math.ceil((high - low) / lsb / (2 * HISTOGRAM_BINS)))
         width = codes * lsb / (4 if lattice > 0.0 and codes == 1 else 1)
         first = math.floor((low + before.level) / lsb) * lsb - before.level
         edges = first + (np.arange(math.ceil((high - first) / width) + 1) - 0.5) * width
     else:
-        edges = np.linspace(low, high, BINS + 1)
+        edges = np.linspace(low, high, HISTOGRAM_BINS + 1)
 
     def counted(limit: float) -> Summary:
         def summary(y: Array, w: Array) -> Array:
@@ -357,7 +356,7 @@ def _histogram_of_readings(
 
         return summary
 
-    return Compared(
+    return BeforeAfter(
         "Histogram of the readings",
         caption,
         f"reading less {factor * before.level:.6g}, {unit}" if before.level else f"reading, {unit}",
@@ -394,7 +393,7 @@ def _together(finding: Finding) -> Iterator[Figure]:
 
 def _missing(finding: Finding, record: Record) -> Figure:
     """Gaps in the stamps, and rows that the logger held."""
-    edges, middle = _pieces(record, POINTS // 2)
+    edges, middle = _pieces(record, POINTS_MOST // 2)
     before, after = finding.before.y, finding.after.y
     held = np.append(False, np.diff(before) == 0.0) & ~np.isfinite(after)
     gone = held | ~record.present.astype(bool)
@@ -422,7 +421,7 @@ def _sides(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> Fi
     y = simulated(diagnosed.state, np.random.default_rng(20))
     panels = []
     for title, values in (("Measured", diagnosed.first.y), ("Simulated", y)):
-        x, mean, low, high = envelope(record.time_s, values, POINTS)
+        x, mean, low, high = envelope(record.time_s, values, POINTS_MOST)
         panels.append(
             Panel(
                 title,
@@ -453,8 +452,8 @@ def _series(finding: Finding, record: Record, factor: float, unit: str) -> Figur
         ("Readings and fitted effect", y, effect),
         ("Readings less the effect", y - effect + middle, np.full(y.size, middle)),
     ):
-        x, mean, _, _ = envelope(record.time_s, values, POINTS)
-        _, fitted, _, _ = envelope(record.time_s, line, POINTS)
+        x, mean, _, _ = envelope(record.time_s, values, POINTS_MOST)
+        _, fitted, _, _ = envelope(record.time_s, line, POINTS_MOST)
         shift = float(np.nanmean(mean)) - float(np.nanmean(fitted))
         panels.append(
             Panel(
@@ -473,13 +472,13 @@ def _series(finding: Finding, record: Record, factor: float, unit: str) -> Figur
     return Figure("Means of the readings", caption, panels)
 
 
-def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
+def _evidence(finding: Finding, record: Record) -> Iterator[BeforeAfter]:
     """How the evidence for a column grows along the record: the score of its whitened form, in standard deviations."""
     effect = _effect(finding)
     if not np.ptp(effect) > 0.0:
         return
     count = 1 + len(finding.before.regressors)
-    marks = np.unique(np.linspace(0, effect.size - 1, min(effect.size, POINTS // 2)).astype(int))
+    marks = np.unique(np.linspace(0, effect.size - 1, min(effect.size, POINTS_MOST // 2)).astype(int))
 
     def path(state: State) -> Summary:
         series = replace(state.series, columns=state.series.columns[:count]).beside(effect)
@@ -489,7 +488,7 @@ def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
         z = z / max(float(np.linalg.norm(z)), 1e-300)
         return lambda y, w: np.cumsum(np.nan_to_num(w) * z)[marks]
 
-    yield Compared(
+    yield BeforeAfter(
         "Evidence along the record",
         "Sum of prediction errors times the effect's expected trace in them, in standard deviations of chance. "
         "A steady climb is an effect that acts all the time; one jump is a single event.",
@@ -503,7 +502,7 @@ def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
 
 
 #: The pictures by the names that causes give: of a finding, in a record, with the factor to a unit.
-_PICTURES: Mapping[str, Callable[[Finding, Record, float, str], Iterable[Compared | Figure]]] = {
+_PICTURES: Mapping[str, Callable[[Finding, Record, float, str], Iterable[BeforeAfter | Figure]]] = {
     "means": lambda finding, record, factor, unit: [_series(finding, record, factor, unit)],
     "evidence": lambda finding, record, factor, unit: _evidence(finding, record),
     "spectrum": lambda finding, record, factor, unit: [_spectrum(finding.before, finding.after, factor, unit)],
@@ -511,7 +510,7 @@ _PICTURES: Mapping[str, Callable[[Finding, Record, float, str], Iterable[Compare
     "line": lambda finding, record, factor, unit: [_line(finding, factor, unit)],
     "allan": lambda finding, record, factor, unit: [_allan(finding.before, finding.after, factor, unit)],
     "marked_level": lambda finding, record, factor, unit: [_level(finding, record, marked=True)],
-    "fine_level": lambda finding, record, factor, unit: [_level(finding, record, marked=True, pieces=POINTS // 2)],
+    "fine_level": lambda finding, record, factor, unit: [_level(finding, record, marked=True, pieces=POINTS_MOST // 2)],
     "largest": lambda finding, record, factor, unit: [_largest(finding, record)],
     "histogram": lambda finding, record, factor, unit: [_histogram(finding.before, finding.after)],
     "lattice": lambda finding, record, factor, unit: [_lattice(finding, factor, unit)],

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from selfcal.base.errors import UserError, install
+from selfcal.base.errors import UserError, install_line
 from selfcal.base.output import TABLE_WIDTH
 
 
@@ -186,7 +186,7 @@ class Document(Object):
         try:
             import pandas
         except ImportError:
-            raise UserError(f"to_frame() takes pandas: {install('pandas')}") from None
+            raise UserError(f"to_frame() takes pandas: {install_line('pandas')}") from None
         return pandas.DataFrame(list(self._rows()))
 
     def _console(self, **more: Any) -> Any:
@@ -235,8 +235,9 @@ class Identification(Document):
     def plot(self, path: Path | str | None = None, *, datasheet: bool = False) -> Picture | None:
         """The Allan deviation of each axis with the model's, as `identify --plot` has it: a picture, which a notebook
         shows, or the file `path`. `datasheet`: in the units of data sheets. Raises UserError."""
-        from selfcal.base.output import check_picture, png_of
+        from selfcal.base.output import check_picture
         from selfcal.show.allan_plot import figure_of, plot_allan
+        from selfcal.show.plots import png_of
 
         if path is None:
             return Picture(png_of(figure_of(self, datasheet=datasheet), dpi=90))
@@ -343,7 +344,7 @@ class Diagnosis(Document):
     axes: dict[str, DiagnosedAxis]
     model: dict[str, Any]
     navigation: dict[str, Any] | None
-    _shown_by = "findings"
+    _shown_by = "diagnosis_lines"
 
     def _rows(self) -> Iterator[dict[str, Any]]:
         """Axis, cause, evidence and each number of its estimate, of what acts on all axes too; `value`: no number. Of

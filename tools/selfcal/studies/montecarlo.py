@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.adequacy.drawn import draw, has_nodes, simulate_bank_samples
-from selfcal.bank.result import HALF_90, likeliest
+from selfcal.adequacy.drawn import draw_parameters, has_nodes, simulate_bank_samples
+from selfcal.bank.axis_result import HALF_90, likeliest
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
@@ -38,10 +38,10 @@ def rows_of(model: Model, axis: str, duration_s: float, job: tuple[str, int]) ->
     tables = make_tables(model, rate_hz, (axis,))
     index = list(model.hypotheses).index(law)
     rng = np.random.default_rng([seed, index])
-    truth = draw(model.group_of(axis), law, rng)
+    truth = draw_parameters(model.group_of(axis), law, rng)
     drawn = 1
     while not has_nodes(model.laws[law], truth, tables):
-        truth = draw(model.group_of(axis), law, rng)
+        truth = draw_parameters(model.group_of(axis), law, rng)
         drawn += 1
     y, bias_now = simulate_bank_samples(
         model.laws[law], truth, rate_hz, block * round(duration_s * model.bank_rate_hz), seed, block

@@ -11,16 +11,17 @@ import numpy as np
 from scipy import optimize
 from scipy.special import exprel
 
+from selfcal.base.grid import Array
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
-from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
+from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S
 from selfcal.model.tables import make_tables
-from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
+from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, FilterNoise, Filters, Part, nees, true_noise
 
 if TYPE_CHECKING:
+    from selfcal.bank.axis_result import AxisResult
     from selfcal.bank.library import Bank
-    from selfcal.bank.result import AxisResult
 
 SCHEMA = "selfcal.navigate/1"
 #: Factor by which filter designers inflate a data sheet's noise.
@@ -63,7 +64,7 @@ def sheet_noise(factor: float = 1.0) -> list[Mapping[str, float]]:
     ]
 
 
-def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
+def identified_noise(rest: Array) -> list[Mapping[str, float]]:
     """By AXES: the noise of a rest [REST_S, axes] in their units, with the spread of its posterior.
 
     N has the mean square of all laws. Where the constant is the most probable law, there is no drift. Else the drift
@@ -74,10 +75,10 @@ def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
 
     bank = Bank(make_tables(Model.load(), 1.0, tuple(AXES), bank_rate_hz=1.0))
     bank.push(rest)
-    return [noise_of(bank, k)[0] for k in range(len(AXES))]
+    return [bank_noise(bank, k)[0] for k in range(len(AXES))]
 
 
-def noise_of(bank: Bank, axis: int, mask: int = 0) -> tuple[dict[str, float], AxisResult]:
+def bank_noise(bank: Bank, axis: int, mask: int = 0) -> tuple[dict[str, float], AxisResult]:
     """The noise of an axis by a bank, as `identified_noise` has it, in the bank's units, and the bank's report."""
     now, *later = (bank.report(axis, mask, ahead) for ahead in (0.0, *HORIZONS_S))
     white = [(now.probability[law], estimates["N"]) for law, estimates in now.parameters.items()]
@@ -115,7 +116,7 @@ def rows_of(job: Job) -> list[Row]:
     }
     rows: list[Row] = [{"law": job.law, "seed": seed} for seed in job.seeds]
     for name, noise in noises.items():
-        filters = Filters(Noise.of(noise), part)
+        filters = Filters(FilterNoise.of(noise), part)
         filters.rest()
         for time, (errors, covariance) in zip(TIMES, filters.fly(), strict=True):
             figures = {

@@ -26,13 +26,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from selfcal.base.grid import slices
-from selfcal.base.units import STANDARD_GRAVITY, convert
+from selfcal.base.grid import Array, slices
+from selfcal.base.units import STANDARD_GRAVITY, converted
 from selfcal.calibration.gyroscope import cross
-from selfcal.model.simulated_parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
+from selfcal.model.simulated_parts import AXES, TRUTHS, TURN_ON, generator, simulate_axis
 
 #: Lengths of the rest, and of the flight with GPS and after its outage, s; the longest outage that is flown.
-REST_S, GPS_S, OUTAGE_S, LONGEST_S = 1800, 300, 60, 300
+REST_S, GPS_S, OUTAGE_S, LONGEST_OUTAGE_S = 1800, 300, 60, 300
 #: Readings per s in flight.
 RATE_HZ = 10
 #: Latency of a position, and the sd of its error by part, s; a position's own sd by axis, m.
@@ -43,7 +43,7 @@ TILT_SD, HEADING_SD, START_SD_M = 0.1, 2.0, 3.0
 TURN, TAKE_OFF_S, TURN_PERIOD_S = 10.0, 20.0, 60.0
 #: Units of the filter, by AXES, and the size of each axis' unit in them.
 SI = {"deg/s": "rad/s", "m/s^2": "m/s^2"}
-SCALE = np.array([convert(np.ones(1), unit, SI[unit])[0] for unit in AXES.values()])
+SCALE = np.array([converted(np.ones(1), unit, SI[unit])[0] for unit in AXES.values()])
 _UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 #: Sizes of the error state: position, velocity, attitude, the biases' constants and drifts (gyros, accelerometers),
 #: latency. What is judged has the sums of the constants and the drifts.
@@ -57,17 +57,17 @@ JUDGED = len(_JUDGED)
 
 
 @dataclass(frozen=True)
-class Noise:
+class FilterNoise:
     """What filters hold of the readings, [filters, 6], by AXES in SI units: white noise N, random walk K, and the drift
     of a Gauss-Markov law; 0 where it is not in the law."""
 
-    N: Floats
-    K: Floats
-    sigma_m: Floats
-    alpha: Floats
+    N: Array
+    K: Array
+    sigma_m: Array
+    alpha: Array
 
     @classmethod
-    def of(cls, filters: Sequence[Sequence[Mapping[str, float]]]) -> Noise:
+    def of(cls, filters: Sequence[Sequence[Mapping[str, float]]]) -> FilterNoise:
         """The parameters of each axis of each filter, in the units of AXES."""
         values = {
             name: np.array([[axis.get(name, 0.0) for axis in axes] for axes in filters])
@@ -75,7 +75,7 @@ class Noise:
         }
         return cls(values["N"] * SCALE, values["K"] * SCALE, values["sigma_m"] * SCALE, values["alpha"])
 
-    def step(self, dt_s: float) -> tuple[Floats, Floats]:
+    def step(self, dt_s: float) -> tuple[Array, Array]:
         """Over `dt_s`: what is left of a drift, and the variance that comes to it."""
         kept = np.exp(-self.alpha * dt_s)
         return kept, self.K**2 * dt_s + self.sigma_m**2 * (1.0 - kept**2)
@@ -85,18 +85,18 @@ class Noise:
 class Flight:
     """The truth at 0, dt, 2 dt, ...; the rate and the force between them."""
 
-    position: Floats
-    velocity: Floats
-    attitude: Floats
-    rate: Floats
-    force: Floats
+    position: Array
+    velocity: Array
+    attitude: Array
+    rate: Array
+    force: Array
 
 
 @cache
 def flight() -> Flight:
     """Take-off, then figures of eight at a changing speed in coordinated turns, which let the biases be seen."""
     dt = 1.0 / RATE_HZ
-    t = np.arange((GPS_S + LONGEST_S) * RATE_HZ + 1) * dt
+    t = np.arange((GPS_S + LONGEST_OUTAGE_S) * RATE_HZ + 1) * dt
     after = np.maximum(t - TAKE_OFF_S, 0.0)
     start = 0.5 * (1.0 - np.cos(np.pi * np.minimum(t / TAKE_OFF_S, 1.0)))
     speed = 20.0 * start + 4.0 * np.sin(2.0 * np.pi * after / 47.0)
@@ -122,13 +122,13 @@ class Part:
     """Parts [parts, ...] in SI units: readings of the rest (means of 1 s) and the flight, and the biases in the latter;
     positions by GPS, late by LATENCY_S, at each s; the error of the latency, s, and those of the start."""
 
-    rest: Floats
-    readings: Floats
-    bias: Floats
-    gps: Floats
-    latency: Floats
-    start_position: Floats
-    start_attitude: Floats
+    rest: Array
+    readings: Array
+    bias: Array
+    gps: Array
+    latency: Array
+    start_position: Array
+    start_attitude: Array
 
     @classmethod
     def of(cls, law: str, seeds: Sequence[int], *, noise: float = 1.0) -> Part:
@@ -136,7 +136,7 @@ class Part:
         return cls._of([_part(law, seed, noise) for seed in seeds])
 
     @classmethod
-    def of_errors(cls, rest: Floats, errors: Floats) -> Part:
+    def of_errors(cls, rest: Array, errors: Array) -> Part:
         """Flights with these errors of the readings in SI units: `rest` [flights, s, 6] means of 1 s, `errors`
         [flights, readings, 6]. How much of an error is bias is not known: none, so that no error of it is judged."""
         pairs = enumerate(zip(rest, errors, strict=True))
@@ -149,14 +149,14 @@ class Part:
 
 def _part(law: str, seed: int, noise: float) -> dict[str, Any]:
     samples = (REST_S + GPS_S + OUTAGE_S) * RATE_HZ
-    simulated = [simulate(law, samples, seed, axis=axis, rate_hz=RATE_HZ) for axis in AXES]
+    simulated = [simulate_axis(law, samples, seed, axis=axis, rate_hz=RATE_HZ) for axis in AXES]
     errors, bias = (noise * SCALE * np.array(both).T for both in zip(*simulated, strict=True))
     rest = REST_S * RATE_HZ
     means = errors[:rest].reshape(REST_S, RATE_HZ, -1).mean(axis=1)
     return _flown(generator(law, seed, len(AXES)), means, errors[rest:], bias[rest:], noise)
 
 
-def _flown(rng: np.random.Generator, rest: Floats, errors: Floats, bias: Floats, noise: float = 1.0) -> dict[str, Any]:
+def _flown(rng: np.random.Generator, rest: Array, errors: Array, bias: Array, noise: float = 1.0) -> dict[str, Any]:
     """A part by the errors of its readings: the flight, its GPS and its start are simulated."""
     truth = flight()
     still = np.concatenate([np.zeros(3), truth.attitude[0].T @ _UP])
@@ -178,7 +178,7 @@ def _flown(rng: np.random.Generator, rest: Floats, errors: Floats, bias: Floats,
 class Filters:
     """Filters side by side, each with its own noise, of one part or of as many parts as there are filters."""
 
-    def __init__(self, noise: Noise, part: Part) -> None:
+    def __init__(self, noise: FilterNoise, part: Part) -> None:
         count = len(noise.N)
         self.noise, self.part = noise, part
         turn = Rotation.from_rotvec(part.start_attitude).inv().as_matrix()
@@ -211,7 +211,7 @@ class Filters:
             self.update(measure, self.part.rest[:, k] - expected, self.noise.N**2)
             self.predict(move, kept, variance)
 
-    def fly(self, outages_s: Sequence[int] = (0, OUTAGE_S)) -> list[tuple[Floats, Floats]]:
+    def fly(self, outages_s: Sequence[int] = (0, OUTAGE_S)) -> list[tuple[Array, Array]]:
         """The errors that are judged and their covariance, [filters, JUDGED] and [filters, JUDGED, JUDGED]: so long
         after GPS_S, when the last position, of LATENCY_S earlier, has come; `outages_s` ascend."""
         judged = []
@@ -224,7 +224,7 @@ class Filters:
             self.move(self.part.readings[:, k])
         return [*judged, self.judged((GPS_S + outages_s[-1]) * RATE_HZ)]
 
-    def locate(self, gps: Floats) -> None:
+    def locate(self, gps: Array) -> None:
         """A position by GPS: where the vehicle was `latency` ago, over which its velocity counts as constant."""
         measure = np.zeros((len(self.position), 3, _STATES))
         measure[:, :, _P] = np.eye(3)
@@ -233,7 +233,7 @@ class Filters:
         expected = self.position - self.latency * self.velocity
         self.update(measure, gps - expected, np.full((1, 3), GPS_SD_M**2))
 
-    def move(self, readings: Floats) -> None:
+    def move(self, readings: Array) -> None:
         """Strapdown by the readings [filters or 1, 6] of an interval."""
         dt = 1.0 / RATE_HZ
         corrected = readings - self.constant - self.drift
@@ -258,13 +258,13 @@ class Filters:
         self.attitude = self.attitude @ turn
         self.predict(move, kept, variance, noise)
 
-    def predict(self, move: Floats, kept: Floats, variance: Floats, noise: Floats | float = 0.0) -> None:
+    def predict(self, move: Array, kept: Array, variance: Array, noise: Array | float = 0.0) -> None:
         """The drift and the covariance over an interval."""
         self.drift = self.drift * kept
         self.covariance = move @ self.covariance @ move.transpose(0, 2, 1) + noise
         np.einsum("...ii->...i", self.covariance)[:, _DRIFT] += variance
 
-    def update(self, measure: Floats, innovation: Floats, variance: Floats) -> None:
+    def update(self, measure: Array, innovation: Array, variance: Array) -> None:
         """Kalman's update; the error's estimate goes into the state at once."""
         seen = measure @ self.covariance
         of_innovation = seen @ measure.transpose(0, 2, 1) + variance[:, :, None] * np.eye(variance.shape[1])
@@ -279,7 +279,7 @@ class Filters:
         self.drift = self.drift + error[:, _DRIFT]
         self.latency = self.latency + error[:, _LATENCY]
 
-    def judged(self, k: int) -> tuple[Floats, Floats]:
+    def judged(self, k: int) -> tuple[Array, Array]:
         """Errors at reading `k` and their covariance."""
         truth = flight()
         turned = Rotation.from_matrix(self.attitude.transpose(0, 2, 1) @ truth.attitude[k]).as_rotvec()
@@ -291,9 +291,9 @@ class Filters:
         )
 
 
-def nees(errors: Floats, covariance: Floats) -> Floats:
+def nees(errors: Array, covariance: Array) -> Array:
     """Normalised estimation error squared, [filters]: of a filter that is consistent, chi-squared of JUDGED degrees."""
-    squares: Floats = np.einsum("bi,bi->b", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
+    squares: Array = np.einsum("bi,bi->b", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
     return squares
 
 

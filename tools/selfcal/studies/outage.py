@@ -20,36 +20,37 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from selfcal.bank.blocks import block_means
+from selfcal.bank.blocks import blocks_of
 from selfcal.bank.library import Bank
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis import words
-from selfcal.diagnosis.carried import Term, term_of, why_stays, with_terms
+from selfcal.diagnosis.carried import BankTerm, term_of, why_stays, with_terms
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model
 from selfcal.model.regressors import columns_of, mask_of, offered
-from selfcal.model.simulated_parts import AXES, SHEET_N, Floats
+from selfcal.model.simulated_parts import AXES, SHEET_N
 from selfcal.model.tables import make_tables
 from selfcal.readings.readings import look
-from selfcal.studies.navigate import noise_of
+from selfcal.studies.navigate import bank_noise
 from selfcal.studies.navigation import (
     GPS_S,
-    LONGEST_S,
+    LONGEST_OUTAGE_S,
     OUTAGE_S,
     RATE_HZ,
     REST_S,
     SCALE,
+    FilterNoise,
     Filters,
-    Noise,
     Part,
     nees,
 )
 
 #: Outages after which the position is judged, s; the one of the sentence is OUTAGE_S.
-OUTAGES_S = (10, OUTAGE_S, LONGEST_S)
+OUTAGES_S = (10, OUTAGE_S, LONGEST_OUTAGE_S)
 #: Flights, evenly spread; coordinates of a position.
 FLIGHTS, COORDINATES = 50, 3
 #: Assumptions behind the numbers.
@@ -64,12 +65,12 @@ CANCELS = (
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownAxis:
     """What a filter knows of an axis: its noise in the units of AXES, and the errors of its readings [s], means of 1 s
     in the same unit."""
 
     noise: Mapping[str, float]
-    errors: Floats
+    errors: Array
 
 
 def add_outages(
@@ -86,7 +87,7 @@ def add_outages(
     flown = recording if second is None else second
     names = [name for name in AXES if name in diagnosed and name in flown.columns]
     extended = {regressor.name: regressor for regressor in Model.of_tree(tree, model.path).regressors}
-    terms: dict[str, list[tuple[str, Term]]] = {name: [] for name in names}
+    terms: dict[str, list[tuple[str, BankTerm]]] = {name: [] for name in names}
     reasons: dict[str, str] = {}
     for name in names:
         for finding, entry in zip(diagnosed[name].by_gain, document["axes"][name]["findings"], strict=True):
@@ -97,7 +98,7 @@ def add_outages(
                 terms[name].append((entry["of"], term))
 
     @cache
-    def known(name: str, without: str) -> Known:
+    def known(name: str, without: str) -> KnownAxis:
         own = [term for of, term in terms[name] if of != without]
         return _known(model, record, diagnosed, name, own, recording, second)
 
@@ -136,10 +137,10 @@ def _known(
     record: Record,
     diagnosed: Mapping[str, Diagnosed],
     name: str,
-    terms: Sequence[Term],
+    terms: Sequence[BankTerm],
     recording: Recording,
     second: Recording | None,
-) -> Known:
+) -> KnownAxis:
     """Noise and errors of an axis by a model with these terms."""
     own = with_terms(model, record, diagnosed, name, terms, [column for term in terms for column in term.columns])
     stays = {column.name for term in terms if why_stays(term.finding) for column in term.columns}
@@ -157,15 +158,15 @@ def _known(
         c = _learned(fresh, name, readings, values, columns, values.size // 2)[1] if anew else np.zeros(0)
     group = replace(own.group_of(name), range=0.0, stuck_limit=0)
     rate_hz = readings.rate_hz
-    seconds = block_means(values - columns @ c, readings.missing_before, max(1, round(rate_hz)), group)
+    seconds = blocks_of(values - columns @ c, readings.missing_before, max(1, round(rate_hz)), group)
     factor = units.factor(group.unit, AXES[name])
     errors = np.concatenate([np.full(round(seconds.begin / rate_hz), np.nan), seconds.mean])
-    return Known(
+    return KnownAxis(
         {key: value if key == "alpha" else value * factor for key, value in noise.items()}, bridged(errors) * factor
     )
 
 
-def _readings(own: Model, name: str, recording: Recording) -> tuple[Floats, Floats, Recording]:
+def _readings(own: Model, name: str, recording: Recording) -> tuple[Array, Array, Recording]:
     """Readings [n] of an axis less their median, the columns [n, p] about their references, and the recording."""
     seen = look(recording.along(name), name, own.group_of(name))
     if seen.recording.rate_hz < 1.0:
@@ -183,39 +184,39 @@ def _readings(own: Model, name: str, recording: Recording) -> tuple[Floats, Floa
 
 
 def _learned(
-    own: Model, name: str, recording: Recording, values: Floats, columns: Floats, upto: int
-) -> tuple[Mapping[str, float], Floats]:
+    own: Model, name: str, recording: Recording, values: Array, columns: Array, upto: int
+) -> tuple[Mapping[str, float], Array]:
     """Noise of an axis and its coefficients [p], by the bank after the first `upto` readings."""
     regressors = offered(own, name)
     tables = make_tables(replace(own, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=1.0)
     bank = Bank(tables)
     rows = as_float(columns + [column.reference for column in tables.regressors])[:upto] if regressors else None
     bank.push(as_float(values)[:upto, None], recording.missing_before[:upto], rows)
-    noise, now = noise_of(bank, 0, mask_of(regressors, regressors))
+    noise, now = bank_noise(bank, 0, mask_of(regressors, regressors))
     return noise, np.array([mean for mean, _ in now.coefficients[now.best]])
 
 
-def flights(known: Mapping[str, Known]) -> dict[str, dict[str, Any]]:
+def flights(known: Mapping[str, KnownAxis]) -> dict[str, dict[str, Any]]:
     """By outage, s: rms error of the position, m, mean of its NEES and the 95 % band of it, in FLIGHTS of the second
     half. Raises UserError of errors that are too short."""
     seconds = min(axis.errors.size for axis in known.values())
-    first, last = seconds // 2, seconds - GPS_S - LONGEST_S
+    first, last = seconds // 2, seconds - GPS_S - LONGEST_OUTAGE_S
     if last < first:
-        raise UserError(f"flights need a recording of {2 * (GPS_S + LONGEST_S)} s or more")
+        raise UserError(f"flights need a recording of {2 * (GPS_S + LONGEST_OUTAGE_S)} s or more")
     white = _white(seconds)
     own, noise = [], []
     for name, unit in AXES.items():
         alike = [axis.noise["N"] ** 2 for other, axis in known.items() if AXES[other] == unit]
         N = math.sqrt(sum(alike) / len(alike)) if alike else SHEET_N[unit]
-        axis = known.get(name, Known({"N": N}, N * white[name]))
+        axis = known.get(name, KnownAxis({"N": N}, N * white[name]))
         own.append(axis.errors[:seconds])
         noise.append(axis.noise)
     errors = np.stack(own, axis=1) * SCALE
     starts = np.linspace(first, last, FLIGHTS).astype(int)
-    flown = np.arange(GPS_S + LONGEST_S)
+    flown = np.arange(GPS_S + LONGEST_OUTAGE_S)
     rest = np.arange(-min(REST_S, first), 0)
     part = Part.of_errors(errors[starts[:, None] + rest], np.repeat(errors[starts[:, None] + flown], RATE_HZ, axis=1))
-    filters = Filters(Noise.of([noise] * FLIGHTS), part)
+    filters = Filters(FilterNoise.of([noise] * FLIGHTS), part)
     filters.rest()
     position = slice(0, COORDINATES)
     by_outage: dict[str, dict[str, Any]] = {}
@@ -231,18 +232,18 @@ def flights(known: Mapping[str, Known]) -> dict[str, dict[str, Any]]:
     return by_outage
 
 
-def _white(seconds: int) -> dict[str, Floats]:
+def _white(seconds: int) -> dict[str, Array]:
     """White noise [s] of each of AXES, the same at every call."""
     random = np.random.default_rng(0)
     return {name: random.standard_normal(seconds) for name in AXES}
 
 
-def _check(known: Mapping[str, Known]) -> None:
+def _check(known: Mapping[str, KnownAxis]) -> None:
     """Raise UserError where flights with white noise alone, as the axes have it, are not as exact as they state: then
     the filter's own approximations show, not the axes."""
     white = _white(max(axis.errors.size for axis in known.values()))
     ideal = {
-        name: Known({"N": axis.noise["N"]}, axis.noise["N"] * white[name][: axis.errors.size])
+        name: KnownAxis({"N": axis.noise["N"]}, axis.noise["N"] * white[name][: axis.errors.size])
         for name, axis in known.items()
     }
     side = flights(ideal)[f"{OUTAGE_S}"]

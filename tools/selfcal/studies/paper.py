@@ -11,7 +11,7 @@ from typing import Any
 from selfcal.base.errors import few
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.show.chart import Figure, draw
-from selfcal.show.template import render
+from selfcal.show.page_template import render
 from selfcal.studies.paper_figures import section4
 from selfcal.studies.paper_figures.reproduction import Reproduction
 
@@ -38,7 +38,7 @@ def with_reason(
     ]
 
 
-def page(figures: Sequence[Reproduction], records: int, seed: int) -> str:
+def paper_html(figures: Sequence[Reproduction], records: int, seed: int) -> str:
     """One self-contained page: a table of all figures, then each with its pictures."""
     pictures = [[figure.figures] if isinstance(figure.figures, Figure) else figure.figures for figure in figures]
     drawn = [[draw(picture) for picture in own] for own in pictures]

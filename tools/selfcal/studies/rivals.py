@@ -17,16 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 
-from selfcal.adequacy.document import recording_entry
 from selfcal.adequacy.identify import chosen_axes
+from selfcal.adequacy.identify_document import recording_entry
 from selfcal.bank.blocks import MOST_DENSE
 from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
-from selfcal.base.grid import runs
+from selfcal.base.grid import Array, runs
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.base.progress import bar
 from selfcal.batch.spread import record_seeds, spread, workers
@@ -35,7 +34,7 @@ from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED, PLAIN
 from selfcal.show.identification import fitting
 from selfcal.studies.methods import RIVALS, Rival
-from selfcal.studies.methods.ensemble import Cell, over_laws, rows_of, summary
+from selfcal.studies.methods.ensemble import Cell, ensemble_summary, over_laws, rows_of
 from selfcal.studies.methods.problem import Answer, Problem
 
 SCHEMA = "selfcal.rivals/1"
@@ -44,7 +43,7 @@ ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"
 ENSEMBLE = DEFAULT.with_name("ensemble.yaml")
 SAMPLES = (150, 600)
 #: Bank samples that every method can work with: five points of an Allan curve.
-FEWEST = 50
+RIVAL_SAMPLES_LEAST = 50
 
 
 def of_recording(
@@ -102,8 +101,8 @@ class Ensemble:
         seeds = record_seeds(self.records, self.seed)
         if self.truth not in ("middle", "prior"):
             raise UserError(f"--truth is middle or prior, not '{self.truth}'")
-        if not all(FEWEST <= n <= MOST_DENSE for n in self.samples):
-            raise UserError(f"--samples must be {FEWEST} to {MOST_DENSE}")
+        if not all(RIVAL_SAMPLES_LEAST <= n <= MOST_DENSE for n in self.samples):
+            raise UserError(f"--samples must be {RIVAL_SAMPLES_LEAST} to {MOST_DENSE}")
         if not set(self.model.hypotheses) <= set(PLAIN):
             raise UserError(f"{self.model.path}: rivals knows the laws {', '.join(PLAIN)} alone: leave the others out")
         given = {"axis": self.axis, "truth": self.truth, "seed": self.seed}
@@ -121,7 +120,7 @@ class Ensemble:
             results=results,
             count=workers,
         )
-        entries = summary(rows, self.model.group_of(self.axis))
+        entries = ensemble_summary(rows, self.model.group_of(self.axis))
         document = {"schema": ENSEMBLE_SCHEMA, "model": str(self.model.path), **given, "records_per_law": self.records}
         return document | {"cells": entries, "choice": over_laws(entries)}
 
@@ -144,16 +143,16 @@ def problem_of(recording: Recording, name: str, model: Model, decimate: float | 
         raise UserError(f"{model.path}: rivals knows the laws {', '.join(PLAIN)}: the model has none of them")
     mean, dt_s = bank_means(recording, model, name, decimate)
     y = longest_stretch(mean)
-    if y.size < FEWEST:
+    if y.size < RIVAL_SAMPLES_LEAST:
         raise UserError(
             f"{recording.path}: {name}: {y.size} averages of {dt_s:g} s without a gap are too few, "
-            f"{FEWEST} are needed: record longer, or give --decimate HZ"
+            f"{RIVAL_SAMPLES_LEAST} are needed: record longer, or give --decimate HZ"
         )
     alone = replace(model.group_of(name), axes=(name,))
     return Problem(y, dt_s, alone, laws), int(np.isfinite(mean).sum()) - y.size
 
 
-def longest_stretch(mean: NDArray[np.float64]) -> NDArray[np.float64]:
+def longest_stretch(mean: Array) -> Array:
     """The longest run of finite values."""
     start, end = max(runs(np.isfinite(mean)), key=lambda run: run[1] - run[0])
     return mean[start:end]

@@ -12,12 +12,13 @@ import numpy as np
 from scipy import signal
 
 from selfcal.base.errors import UserError, printable
+from selfcal.base.grid import Array
 from selfcal.base.output import console_of, print_line, table_of
-from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
+from selfcal.base.units import STANDARD_GRAVITY, converted, same_kind
 from selfcal.batch.spread import Row
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Group, Model
-from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
+from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, simulate_axis
 from selfcal.model.tables import make_tables
 
 SCHEMA = "selfcal.worth/1"
@@ -58,14 +59,14 @@ class Job:
     seed: int
 
 
-def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, Floats], Floats]:
+def predictions(model: Model, axis: str, y: Array) -> tuple[dict[str, Array], Array]:
     """The bias at each of SECONDS by each method, and the bank's own sd."""
     from selfcal.bank.library import Bank
 
     bank = Bank(make_tables(model, 1.0, (axis,), bank_rate_hz=1.0))
     bank.push(y[:, None])
     predicted = np.array(bank.raw.predict(0, [float(s) for s in SECONDS]))
-    level: dict[str, Callable[[Group, Floats], float]] = {
+    level: dict[str, Callable[[Group, Array], float]] = {
         "last": lambda _, seen: float(seen[-LAST_S:].mean()),
         "rest": lambda _, seen: float(seen.mean()),
         "exponential": lambda _, seen: _average(seen, -math.expm1(-2.0 * math.pi * CORNER_HZ)),
@@ -77,12 +78,12 @@ def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, Floats], 
     return {"bank": predicted[:, 0], **levels}, predicted[:, 1]
 
 
-def heading_error(rate: Floats) -> float:
+def heading_error(rate: Array) -> float:
     """deg after the seconds of `rate` [seconds], the error of an upright gyro in deg/s: psi' = rate."""
     return float(rate.sum())
 
 
-def position_error(rate: Floats, acceleration: Floats) -> float:
+def position_error(rate: Array, acceleration: Array) -> float:
     """m along one level axis after the seconds of `rate` and `acceleration` [seconds], the errors of the gyro across in
     deg/s and of the accelerometer along in m/s^2.
 
@@ -95,7 +96,7 @@ def position_error(rate: Floats, acceleration: Floats) -> float:
     return float(STANDARD_GRAVITY * by_tilt + ((left + 1) ** 2 - left**2) @ acceleration / 2.0)
 
 
-def _average(y: Floats, gain: float) -> float:
+def _average(y: Array, gain: float) -> float:
     """A first-order filter that begins at the first reading."""
     state, _ = signal.lfilter([gain], [1.0, gain - 1.0], y, zi=[(1.0 - gain) * y[0]])
     return float(state[-1])
@@ -115,21 +116,21 @@ class After:
     readings of the minute."""
 
     unit: str
-    predicted: Mapping[str, Floats]
-    sd: Floats
-    minute: Floats
+    predicted: Mapping[str, Array]
+    sd: Array
+    minute: Array
 
     @classmethod
-    def of(cls, model: Model, axis: str, y: Floats, rest: int) -> After:
+    def of(cls, model: Model, axis: str, y: Array, rest: int) -> After:
         """`y`: the rest and what follows."""
         return cls(model.group_of(axis).unit, *predictions(model, axis, y[:rest]), y[rest : rest + RECKONED_S])
 
-    def errors(self, unit: str) -> dict[str, Floats]:
+    def errors(self, unit: str) -> dict[str, Array]:
         """Errors of the minute's corrected readings, by method."""
         errors = {name: self.minute - bias[:RECKONED_S] for name, bias in self.predicted.items()}
-        return {name: convert(error, self.unit, unit) for name, error in errors.items()}
+        return {name: converted(error, self.unit, unit) for name, error in errors.items()}
 
-    def row(self, case: str, rest: int, truth: Floats) -> Row:
+    def row(self, case: str, rest: int, truth: Array) -> Row:
         """Errors of the bias, `truth` at HORIZONS_S."""
         row: Row = {"case": case, "unit": self.unit, "rest_s": rest}
         for horizon, true in zip(HORIZONS_S, truth, strict=True):
@@ -155,18 +156,18 @@ def simulated(model: Model, job: Job) -> list[Row]:
     """One gyro stands for the upright one and for the one across: no figure has both."""
     after, truth, noise = {}, {}, {}
     for axis in ("gx", "ax"):
-        y, truth[axis] = simulate(job.law, job.rest_s + HORIZONS_S[-1], job.seed, axis=axis)
+        y, truth[axis] = simulate_axis(job.law, job.rest_s + HORIZONS_S[-1], job.seed, axis=axis)
         noise[axis] = (y - truth[axis])[job.rest_s :][:RECKONED_S]
-        after[axis] = After.of(model, axis, convert(y, AXES[axis], model.group_of(axis).unit), job.rest_s)
+        after[axis] = After.of(model, axis, converted(y, AXES[axis], model.group_of(axis).unit), job.rest_s)
     samples = [job.rest_s - 1 + h for h in HORIZONS_S]
-    row = after["gx"].row(job.law, job.rest_s, convert(truth["gx"][samples], AXES["gx"], after["gx"].unit))
+    row = after["gx"].row(job.law, job.rest_s, converted(truth["gx"][samples], AXES["gx"], after["gx"].unit))
     row |= _heading(after["gx"]) | _position(after["gx"], after["ax"])
     row[f"heading_deg.{KNOWN}"] = heading_error(noise["gx"])
     row[f"position_m.{KNOWN}"] = position_error(noise["gx"], noise["ax"])
     return [row]
 
 
-def _means(recording: Recording, model: Model, name: str) -> Floats:
+def _means(recording: Recording, model: Model, name: str) -> Array:
     """Means of 1 s of a recorded axis, NaN in gaps."""
     from selfcal.bank.blocks import bank_means
 

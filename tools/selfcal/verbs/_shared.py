@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from selfcal.model.file import Model
 
 Logs = Annotated[
-    "Data",
-    argument(f"Recording: {READ}; several files are joined by their time stamps", "LOG...", kind=list[Path]),
+    "Data", argument(f"Recording: {READ}; several files are joined by their time stamps", "LOG...", kind=list[Path])
 ]
 ModelFile = Annotated[
     Path | str | None,
@@ -31,8 +30,7 @@ ModelFile = Annotated[
 ]
 ModelArgument = Annotated[Path | str | None, argument("Model file, or a part's name", "MODEL")]
 From = Annotated[
-    Path | str | None,
-    option("Priors as `diagnose --json` measured them", "--from", metavar="DIAGNOSIS.json"),
+    Path | str | None, option("Priors as `diagnose --json` measured them", "--from", metavar="DIAGNOSIS.json")
 ]
 Axes = Annotated[Sequence[str], option("Axis to report (repeat for more); default: all", "--axis", metavar="NAME")]
 Decimate = Annotated[float | None, option("Rate of the block means instead of the model file's", metavar="HZ")]
@@ -62,8 +60,7 @@ LimitsFile = Annotated[
 Junit = Annotated[Path | str | None, option("Write the limits' verdicts as JUnit's XML", metavar="FILE.xml")]
 Verdicts = Annotated[Path | str | None, option("Write the limits' verdicts as CSV", metavar="FILE.csv")]
 Scheduler = Annotated[
-    str | None,
-    option("Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine", metavar="ADDRESS"),
+    str | None, option("Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine", metavar="ADDRESS")
 ]
 Workers = Annotated[
     int | None, option("Processes on this machine; default: one for each processor", metavar="N", min=1)
@@ -73,8 +70,7 @@ PARTS = 200
 #: Length of a record that nobody states, s.
 RECORD_S = 3600.0
 Results = Annotated[
-    Path | str | None,
-    option("Folder that keeps finished records: a later run continues from them", metavar="DIR"),
+    Path | str | None, option("Folder that keeps finished records: a later run continues from them", metavar="DIR")
 ]
 
 

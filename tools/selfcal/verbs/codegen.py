@@ -33,18 +33,18 @@ def codegen(
     Raises UserError for a bad model file, one that the target has no RAM for, or a folder that cannot be written.
     """
     from selfcal.base.output import print_lines
-    from selfcal.diagnosis.warm import load, warmed
+    from selfcal.diagnosis.warm import load_start, warmed
     from selfcal.model.file import Model
     from selfcal.model.tables import make_tables
-    from selfcal.wire.c_tables import check_room, left_out, write_tables
+    from selfcal.wire.c_tables import check_room, unused, write_tables
 
     loaded = Model.load(model)
-    known = None if start is None else load(start, loaded)
+    known = None if start is None else load_start(start, loaded)
     tables = make_tables(loaded, loaded.sensor_rate_hz if rate is None else rate, tuple(axes) if axes else None, target)
     tables = warmed(tables, known)
     check_room(loaded, tables, target, hold)
     write_tables(loaded, tables, Path(output), target, known.of if known is not None else "", hold)
-    print_lines(left_out(loaded, tables, target), to_stderr=True)
+    print_lines(unused(loaded, tables, target), to_stderr=True)
     return tables
 
 

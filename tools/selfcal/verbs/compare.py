@@ -50,11 +50,11 @@ def compare(
     [...]}. `fail_on` is only checked here.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
-    from selfcal.base.ending import Held
+    from selfcal.base.ending import HeldSignals
     from selfcal.base.output import check_writable, write_json, write_text
-    from selfcal.batch.compare import LIMIT, SCHEMA, compared_of, quantities, verdict
-    from selfcal.batch.fail_on import CHANGED, check
-    from selfcal.batch.verdicts import Judged, Limits, Verdict, add_verdicts, check_options, write
+    from selfcal.batch.compare import LIMIT, SCHEMA, compared_of, quantities, verdict_of
+    from selfcal.batch.fail_on import CHANGED, check_cause
+    from selfcal.batch.verdicts import Judged, Limits, Verdict, add_verdicts, check_options, write_verdicts
     from selfcal.logs.recording import list_of
     from selfcal.model.file import Model
     from selfcal.show.results import Comparison
@@ -63,7 +63,7 @@ def compare(
 
     if len(logs) < 2:
         raise UserError(f"compare takes two recordings or more of one part: {called()} compare A B")
-    check(fail_on, more=(CHANGED,))
+    check_cause(fail_on, more=(CHANGED,))
     check_options(limits, junit, verdicts)
     files = [file for log in logs for file in list_of(log)]
     check_writable(json, report, junit, verdicts, inputs=(*files, model, limits))
@@ -87,9 +87,9 @@ def compare(
         diagnosis = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)
         diagnosed = diagnosis["axes"]
         findings += [{**finding, "recording": path} for finding in diagnosis.get("findings", ())]
-        Held().check()
+        HeldSignals().check()
         by_log[path] = {
-            name: verdict(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
+            name: verdict_of(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
         }
         for name, axis in identified.items():
             if axis.get("allan"):
@@ -109,14 +109,14 @@ def compare(
         document["limits"] = [
             {**judgement.entry(), "recording": log} for _, log, of_log in judged for judgement in of_log
         ]
-        write(judged, junit, verdicts)
+        write_verdicts(judged, junit, verdicts)
     none = not any(axis.pairs for axis in compared.values())
     if json is not None and not (none and fail_on is None):
         write_json(document, json)
     if report is not None and not none:
-        from selfcal.show.comparison_page import page
+        from selfcal.show.comparison_page import comparison_html
 
-        write_text(report, page(document, curves))
+        write_text(report, comparison_html(document, curves))
     if none:
         reasons = "; ".join(f"{name}: {', '.join(axis.errors)}" for name, axis in compared.items())
         raise UserError(f"no axis can be compared ({reasons})")

@@ -27,8 +27,8 @@ def dbc(
     from selfcal.base.output import check_writable, write_text
     from selfcal.model.file import Model
     from selfcal.wire.dbc_file import check_node
-    from selfcal.wire.dbc_file import dbc as text_of
-    from selfcal.wire.frames import AXES, axis_unit, carries, names_of
+    from selfcal.wire.dbc_file import dbc_text as text_of
+    from selfcal.wire.frames import AXES, axis_unit, carries, wire_names
 
     check_node(node)
     check_writable(output)
@@ -37,7 +37,7 @@ def dbc(
     if not axes:
         known = ", ".join(f"{axis} [{axis_unit(axis)}]" for axis in AXES)
         raise UserError(f"{loaded.path}: telemetry carries none of its axes in the unit they have (it carries {known})")
-    text = text_of(node, names_of(loaded), axes)
+    text = text_of(node, wire_names(loaded), axes)
     if output is None or str(output) == "-":
         sys.stdout.write(text)
     else:

@@ -11,7 +11,7 @@ from selfcal.logs.loaders import READ
 from selfcal.verbs._shared import ModelFile
 
 #: Least interval of reports, s of module time, and largest speed. A host takes a report a second.
-REPORT_S, FASTEST = 10.0, 1000.0
+REPORT_S, SPEED_MOST = 10.0, 1000.0
 #: python-can's own group and port, so that its tools listen there without more.
 GROUP, PORT = "239.74.163.2", 43113
 #: Time that the firmware waits for a host, s: longer than anybody does.
@@ -45,8 +45,8 @@ def demo(
     from selfcal.wire.frames import SHIPPED
     from selfcal.wire.replay import build, running, write_rows
 
-    if not 0.0 < speed <= FASTEST:
-        raise UserError(f"--speed must be above 0 and at most {FASTEST:g}, not {speed:g}")
+    if not 0.0 < speed <= SPEED_MOST:
+        raise UserError(f"--speed must be above 0 and at most {SPEED_MOST:g}, not {speed:g}")
     if channel and transport != "can":
         raise UserError(f"--channel {channel}: goes with --transport can")
     check_node(node)

@@ -13,7 +13,7 @@ from selfcal.logs.loaders import Reading
 from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
-    from selfcal.base.ending import Held
+    from selfcal.base.ending import HeldSignals
     from selfcal.base.progress import Doing
     from selfcal.diagnosis.finding import Diagnosed
     from selfcal.diagnosis.record import Record
@@ -66,31 +66,31 @@ def diagnose(
     what the user can put right.
 
     Under the command a signal ends it within 2 s: what was found so far is reported and written, axes that show nothing
-    yet have an error. The caller then ends by `Held().check()`; a second signal ends at once.
+    yet have an error. The caller then ends by `HeldSignals().check()`; a second signal ends at once.
     """
-    from selfcal.adequacy.document import of_errors, recording_entry
     from selfcal.adequacy.identify import chosen_axes
+    from selfcal.adequacy.identify_document import of_errors, recording_entry
     from selfcal.bank.priors import add_sources, for_record
-    from selfcal.base.ending import held
+    from selfcal.base.ending import hold_signals
     from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.base.progress import Doing
-    from selfcal.batch.fail_on import check
+    from selfcal.batch.fail_on import check_cause
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.diagnosis import hidden
     from selfcal.diagnosis.diagnose import add_carried, add_posteriors, entry_of, events_of, options_given, shared_by
-    from selfcal.diagnosis.document import SCHEMA, to_document
+    from selfcal.diagnosis.diagnose_document import SCHEMA, diagnose_document
     from selfcal.diagnosis.events import add_findings
-    from selfcal.diagnosis.extend import check_not_by_hand, extended, left_out, write_extended
-    from selfcal.diagnosis.record import of_recording
+    from selfcal.diagnosis.extend import check_not_by_hand, extended, no_room, write_extended
+    from selfcal.diagnosis.record import record_from
     from selfcal.likelihood import work
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
     from selfcal.show.results import Diagnosis
 
     if report is not None:
-        from selfcal.show.diagnosis_page import page
+        from selfcal.show.diagnosis_page import diagnosis_html
 
-    check(fail_on)
+    check_cause(fail_on)
     check_options(limits, junit, verdicts)
     if full_rate and decimate is not None:
         raise UserError("--full-rate looks at every sample, --decimate at means: take one of them")
@@ -104,30 +104,29 @@ def diagnose(
     of_file, loaded = loaded, for_record(loaded, recording, names)
     whole: Reading = {**reading, "start_s": None, "end_s": None}
     second = None if on is None else load(on, sensors=loaded.sensors, **whole)
-    with held() as ending, Doing("diagnose") as doing:
+    with hold_signals() as ending, Doing("diagnose") as doing:
         record, first, diagnosed, errors = _looked(recording, loaded, names, decimate, full_rate, ending, doing)
         with work.within(work.Work(lambda: ending.overdue)):
             if not diagnosed:
                 if fail_on is not None:  # a production line gets its files in each case
                     document = of_errors(SCHEMA, recording_entry(recording), errors) | {"model": {}}
                     if report is not None:
-                        write_text(report, page(document, record, {}))
+                        write_text(report, diagnosis_html(document, record, {}))
                     write_json(document, json)
                 raise _unjudged(recording, errors, ending)
             doing.now("held-out gain")
             sensor = recording.path.name.partition(".")[0] if model is None else None
             tree, read_out = extended(loaded, record, diagnosed, sensor)
-            out = left_out(loaded, diagnosed)
+            out = no_room(loaded, diagnosed)
             doing.now("what the axes share")
             common = shared_by(diagnosed, loaded) if not ending.asked else None
-            quantity = None
-            if common is not None:
+            quantity = None if common is None else entry_of(common, diagnosed, recording, loaded)
+            if common is not None and quantity is not None:
                 hidden.extend(tree, common)
-                quantity = entry_of(common, diagnosed, recording, loaded)
                 if second is not None:
-                    on_second = of_recording(second, loaded, 1.0 / common.dt)
+                    on_second = record_from(second, loaded, 1.0 / common.dt)
                     quantity["gain_on"] = hidden.carried(common, on_second.axes, events_of(on_second))
-            document = to_document(recording, diagnosed, errors, tree, first, [finding for _, finding in out])
+            document = diagnose_document(recording, diagnosed, errors, tree, first, [finding for _, finding in out])
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
@@ -144,13 +143,14 @@ def diagnose(
                 write_extended(write_model, tree, recording.path, read_out, out)
             if report is not None:
                 doing.now("pictures")
-                write_text(report, page(document, record, diagnosed, options_given(axes, model, decimate, recording)))
+                given = options_given(axes, model, decimate, recording)
+                write_text(report, diagnosis_html(document, record, diagnosed, given))
     add_verdicts(document, bounds, junit, verdicts)
     write_json(document, json)
     return Diagnosis(document)
 
 
-def _unjudged(recording: Recording, errors: Mapping[str, str], ending: Held) -> UserError:
+def _unjudged(recording: Recording, errors: Mapping[str, str], ending: HeldSignals) -> UserError:
     """Why no axis has a result. A signal that came ends the command here."""
     ending.check()
     reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
@@ -163,23 +163,23 @@ def _looked(
     names: Sequence[str],
     decimate: float | None,
     full_rate: bool,
-    ending: Held,
+    ending: HeldSignals,
     doing: Doing,
 ) -> tuple[Record, dict[str, Diagnosed], dict[str, Diagnosed], dict[str, str]]:
     """The look at means, whose findings go to stderr, then at every sample: the record, what the first look found, what
     both found together, and why the other axes have no result."""
     from selfcal.diagnosis import diagnose as looks
+    from selfcal.diagnosis.axis_verdict import joined_looks
     from selfcal.diagnosis.loop import INTERRUPTED
-    from selfcal.diagnosis.record import of_recording
-    from selfcal.diagnosis.verdict import joined
+    from selfcal.diagnosis.record import record_from
 
     first: dict[str, Diagnosed] = {}
-    record = of_recording(recording, model, decimate, names)
+    record = record_from(recording, model, decimate, names)
     long = recording.samples >= looks.FIRST_FROM and recording.rate_hz >= looks.LEAST_HZ
     if decimate is None and not full_rate and long:
         means = None
         with suppress(UserError):  # a recording that is too short for means is looked at once
-            means = of_recording(recording, model, looks.FIRST_HZ, names)
+            means = record_from(recording, model, looks.FIRST_HZ, names)
         if means is not None and record.axes:
             first = looks.looked_at(means, names, ending, doing)
             looks.show_first(recording, first, [name for name in names if name in record.axes], ending)
@@ -187,7 +187,7 @@ def _looked(
     diagnosed: dict[str, Diagnosed] = {}
     for name in names:
         only_means = name not in seen and looks.below_lattice(record, name)
-        axis = first.get(name) if only_means else joined(seen.get(name), first.get(name), INTERRUPTED)
+        axis = first.get(name) if only_means else joined_looks(seen.get(name), first.get(name), INTERRUPTED)
         if axis is not None:
             diagnosed[name] = looks.less_stated(axis, model)
     if not ending.asked:
@@ -201,4 +201,4 @@ def _looked(
     return record, first, diagnosed, errors
 
 
-show = shared.shown_by("show.findings", "details", judged=True)
+show = shared.shown_by("show.diagnosis_lines", "details", judged=True)

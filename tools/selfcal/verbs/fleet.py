@@ -12,8 +12,8 @@ from selfcal.logs.loaders import Reading
 from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
-    from selfcal.batch.files import Named
-    from selfcal.batch.unit_table import Unit
+    from selfcal.batch.batch_files import Named
+    from selfcal.batch.unit_table import BatchUnit
 
 
 def fleet(
@@ -69,15 +69,15 @@ def fleet(
 
     import selfcal
     from selfcal.base.output import check_writable, write_json, write_text
-    from selfcal.batch.batch_summary import document_of, lines_of, summed_up
-    from selfcal.batch.fail_on import check
+    from selfcal.batch.batch_summary import batch_keys, lines_of, summed_up
+    from selfcal.batch.fail_on import check_cause
     from selfcal.batch.fleet import document_with, judged_units
-    from selfcal.batch.prior_file import lines_of as lines_of_priors
+    from selfcal.batch.prior_file import prior_lines
     from selfcal.batch.prior_file import write_model as write_priors
     from selfcal.batch.spread import Kept, spread
-    from selfcal.batch.unit_record import KILLED, Options, Verbs, examined, own_pages, settings_of
-    from selfcal.batch.unit_table import Unit, check_table, rows_of, write_table
-    from selfcal.batch.verdicts import Limits, check_options, write
+    from selfcal.batch.unit_record import KILLED, Options, Verbs, examined, own_pages, record_settings
+    from selfcal.batch.unit_table import BatchUnit, check_table, unit_rows, write_table
+    from selfcal.batch.verdicts import Limits, check_options, write_verdicts
     from selfcal.model.file import Model
     from selfcal.model.file import settings_of as model_settings_of
     from selfcal.verbs.diagnose import diagnose as run_diagnose
@@ -87,7 +87,7 @@ def fleet(
     dbc = reading.get("dbc")
     check_options(limits, junit, verdicts)
     check_writable(output, junit, verdicts, json, report, write_model, inputs=(model, units_table, dbc, limits))
-    check(fail_on)
+    check_cause(fail_on)
     if fail_on is not None and fail_on != "inadequate" and not diagnose:
         raise UserError(f"--fail-on {fail_on}: give --diagnose too, which looks for causes")
     loaded = Model.load(model)
@@ -107,7 +107,7 @@ def fleet(
         | ({} if dbc is None else {"dbc": str(Path(dbc).absolute())}),
     )
     version = str(selfcal.__version__)
-    kept = Kept(folder, settings_of(options, model_settings_of(loaded), version), key=itemgetter(1))  # its content
+    kept = Kept(folder, record_settings(options, model_settings_of(loaded), version), key=itemgetter(1))  # its content
     sources = [source for source in named.sources if not source.copy_of]
     records = spread(
         partial(examined, verbs, options),
@@ -121,33 +121,33 @@ def fleet(
     )
     record_of = dict(zip((source.path for source in sources), records, strict=True))
     batch = [
-        Unit(source, record_of.get(source.path, {"error": f"is the same recording as {source.copy_of}"}))
+        BatchUnit(source, record_of.get(source.path, {"error": f"is the same recording as {source.copy_of}"}))
         for source in named.sources
     ]
     _note(batch)
     batch.sort(key=lambda unit: unit.place)
-    write_table(output, (row for unit in batch for row in rows_of(unit, version)))
+    write_table(output, (row for unit in batch for row in unit_rows(unit, version)))
     judged = [] if bounds is None else judged_units(batch, bounds)
-    write(judged, junit, verdicts)
+    write_verdicts(judged, junit, verdicts)
     summary = summed_up(batch, loaded)
-    document = {**document_with(batch, fail_on, judged), **document_of(summary), "words": list(lines_of(summary))}
+    document = {**document_with(batch, fail_on, judged), **batch_keys(summary), "words": list(lines_of(summary))}
     if write_model is not None:
-        document["words"] += lines_of_priors(write_priors(write_model, loaded, summary), loaded)
+        document["words"] += prior_lines(write_priors(write_model, loaded, summary), loaded)
     write_json(document, json)
     if report is not None:
-        from selfcal.batch.fleet_page import page
+        from selfcal.batch.fleet_page import fleet_html
 
         flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
         pages: dict[str, str] = {}
         if diagnose:
             pages = own_pages(f"{report}.units", flagged, summary.devices, verbs, options, kept, workers)
-        write_text(report, page(document, summary, pages))
+        write_text(report, fleet_html(document, summary, pages))
     return document
 
 
-def _note(batch: Sequence[Unit]) -> None:
+def _note(batch: Sequence[BatchUnit]) -> None:
     """Name dates that are left out, and damaged files."""
-    from selfcal.batch.files import DATE_FORM
+    from selfcal.batch.batch_files import DATE_FORM
 
     for unit in batch:
         if unit.undated:
@@ -164,14 +164,14 @@ def _named(
     others: Sequence[Path | str | None],
 ) -> Named:
     """The recordings with their devices. `outputs`, `others`: the run's own files, which are no recordings."""
-    from selfcal.batch.files import sources_of
+    from selfcal.batch.batch_files import batch_sources
 
     given = {Path(str(pattern)).resolve() for pattern in patterns}
     own = [[Path(file) for file in files if file is not None] for files in (outputs, others)]
     for file in own[0]:
         if file.resolve() in given:
             raise UserError(f"{file}: is one of the recordings: give it a name of its own")
-    named = sources_of([str(pattern) for pattern in patterns], units_table, serial_from, own[0] + own[1])
+    named = batch_sources([str(pattern) for pattern in patterns], units_table, serial_from, own[0] + own[1])
     for copy, other in named.copies.items():
         note(f"{copy}: the same recording as {other}: counted once")
     return named

@@ -78,12 +78,12 @@ def identify(
     place: {"error": ...}. Raises UserError for what the user can put right, and if no axis has a result.
     """
     from selfcal.adequacy.checks import against
-    from selfcal.adequacy.document import Identified, to_document
     from selfcal.adequacy.identify import chosen_axes, identify_axis, with_reasons
+    from selfcal.adequacy.identify_document import Identified, identify_document
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, print_line, write_json
     from selfcal.base.progress import bar
-    from selfcal.batch.fail_on import check
+    from selfcal.batch.fail_on import check_cause
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.logs.recording import list_of
     from selfcal.model.file import Model
@@ -91,7 +91,7 @@ def identify(
     from selfcal.show.export import FORMS, write_export
     from selfcal.show.results import Identification
 
-    check(fail_on)
+    check_cause(fail_on)
     check_options(limits, junit, verdicts)
     exported = None if export is None else export[1]
     check_writable(json, plot, exported, junit, verdicts, inputs=(*list_of(log), model, limits))
@@ -125,7 +125,7 @@ def identify(
             except UserError as error:
                 identified[name] = error
         with_reasons(identified, recording, loaded_model)
-        document = to_document(recording, identified, all_failed=json if fail_on is not None else None)
+        document = identify_document(recording, identified, all_failed=json if fail_on is not None else None)
         add_sources(document, of_file, loaded_model)
         doubtful = [
             name
@@ -159,16 +159,16 @@ def identify(
 
 
 def _suspect(document: dict[str, Any], recording: Recording, model: Model, names: Sequence[str]) -> dict[str, Look]:
-    """Name the strongest suspicion of each axis in the document: a test of the readings that are not left out, else the
-    look that explains most. The looks by axis."""
+    """Name the strongest suspicion of each axis in the document: a fault of the readings that are not left out, else
+    the look that explains most. The looks by axis."""
     from selfcal.diagnosis.suspicion import suspicions
-    from selfcal.readings.tests import TESTS
+    from selfcal.readings.faults import FAULTS
 
     suspected = suspicions(recording, model, names)
     for name in names:
         axis = document["axes"][name]
         causes = [suspected[name].cause] if name in suspected else []
-        causes += [test.name for test in TESTS if test.name in axis["checks"].keys() - LEFT_OUT]
+        causes += [fault.name for fault in FAULTS if fault.name in axis["checks"].keys() - LEFT_OUT]
         axis |= {"suspicion": causes[-1]} if causes else {}
     return suspected
 

@@ -17,7 +17,7 @@ from selfcal.verbs._shared import Axes, From, Json, RunPlot
 if TYPE_CHECKING:
     from selfcal.logs.framelog import FrameLog
     from selfcal.wire.frames import Link
-    from selfcal.wire.monitor import Outcome
+    from selfcal.wire.monitor import MonitorOutcome
 
 
 def monitor(
@@ -45,7 +45,7 @@ def monitor(
     once: Annotated[bool, option("End when the port vanishes instead of waiting for it", "--once")] = False,
     json: Json = None,
     plot: RunPlot = None,
-) -> Outcome:
+) -> MonitorOutcome:
     """Show what arrives by `channel`, or what the log `read` holds, until Ctrl-C, its end, or until `duration` (s) is
     over.
 
@@ -57,18 +57,17 @@ def monitor(
     """
     from rich.console import Console
 
-    from selfcal.base.ending import held
+    from selfcal.base.ending import hold_signals
     from selfcal.base.output import check_picture, check_writable, print_line, write_json
     from selfcal.logs.framelog import FrameLog, check_suffix
-    from selfcal.show.plot import plot_run
+    from selfcal.show.run_plot import plot_run
     from selfcal.wire.dbc_file import check_node
     from selfcal.wire.frame_writer import FrameWriter
     from selfcal.wire.frames import Streams, axis_unit, open_bus, serial_ports
     from selfcal.wire.known_models import KnownModels
     from selfcal.wire.live import Contact, View, patient
-    from selfcal.wire.monitor import Outcome, Run
-    from selfcal.wire.streams import LINES, open_streams
-    from selfcal.wire.streams import check as check_stream
+    from selfcal.wire.monitor import MonitorOutcome, Run
+    from selfcal.wire.streams import LINES, check_stream, open_streams
 
     if (channel is None) == (read is None):
         raise UserError(
@@ -95,7 +94,7 @@ def monitor(
     models = KnownModels(model, start)
     streams = Streams(node=node)
     say = partial(print_line, Console(stderr=True))
-    with held() as ending, patient(), ExitStack() as stack:
+    with hold_signals() as ending, patient(), ExitStack() as stack:
         source: Link | FrameLog
         if channel is None:
             source, contact, title = stack.enter_context(FrameLog(name, speed)), None, name
@@ -117,7 +116,7 @@ def monitor(
         view.show(left_over)
         run.pass_on(left_over)
         view.print_last()
-        outcome = Outcome(**vars(streams.statistics))
+        outcome = MonitorOutcome(**vars(streams.statistics))
         for line in run.farewell():
             outcome.contact_lost = not wanted
             say(line)
@@ -137,6 +136,6 @@ def monitor(
     return outcome
 
 
-def show(outcome: Outcome, given: Mapping[str, Any]) -> int:
+def show(outcome: MonitorOutcome, given: Mapping[str, Any]) -> int:
     """Exit code 1 if a module was out of reach when the time was up, or two send as one node."""
     return 1 if outcome.contact_lost or outcome.twins else 0

@@ -31,7 +31,7 @@ def montecarlo(
     """
     from functools import partial
 
-    from selfcal.bank.blocks import FEWEST, MOST_DENSE
+    from selfcal.bank.blocks import BLOCKS_LEAST, MOST_DENSE
     from selfcal.base.output import check_writable, write_json
     from selfcal.batch.spread import record_seeds, spread
     from selfcal.model.file import Model, settings_of
@@ -40,7 +40,7 @@ def montecarlo(
     check_writable(json)
     loaded = Model.load(model)
     seeds = record_seeds(records, seed)
-    least_s, most_s = FEWEST / loaded.bank_rate_hz, MOST_DENSE / loaded.bank_rate_hz
+    least_s, most_s = BLOCKS_LEAST / loaded.bank_rate_hz, MOST_DENSE / loaded.bank_rate_hz
     if not least_s <= duration_s <= most_s:
         raise UserError(f"--duration must be {least_s:g} to {most_s:g} s")
     if loaded.regressors:

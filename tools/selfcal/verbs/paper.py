@@ -33,7 +33,7 @@ def paper(
     from selfcal.base.progress import bar
     from selfcal.batch.spread import record_seeds
     from selfcal.model.file import Model
-    from selfcal.studies.paper import DATA, EXPLAINED, page, with_reason
+    from selfcal.studies.paper import DATA, EXPLAINED, paper_html, with_reason
     from selfcal.studies.paper_figures import section3, section4, survey
     from selfcal.studies.paper_figures.reproduction import Reproduction
     from selfcal.verbs.diagnose import diagnose
@@ -76,7 +76,7 @@ def paper(
         progress.advance(task)
         figures += [section4.figure_8(priors, seed), survey.figure(priors, areas)]
         progress.advance(task)
-    write_text(output, page(figures, records, seed))
+    write_text(output, paper_html(figures, records, seed))
     return figures
 
 

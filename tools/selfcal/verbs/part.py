@@ -29,8 +29,7 @@ def part(
         Sequence[str], option("Number of its data sheet, or gx.N=... (repeat for more)", metavar="N=0.012deg/sqrt(h)")
     ] = (),
     axes: Annotated[
-        Sequence[str],
-        option("Column that is an axis, beside gx to az (repeat for more)", "--axis", metavar="NAME"),
+        Sequence[str], option("Column that is an axis, beside gx to az (repeat for more)", "--axis", metavar="NAME")
     ] = (),
     **reading: Unpack[Reading],
 ) -> Model:
@@ -40,7 +39,7 @@ def part(
     go before the recording's numbers.
     Raises UserError for a recording that moved, a text that is none of these, and a file that cannot be written.
     """
-    from selfcal.adequacy.part import as_text, parse, tree_of
+    from selfcal.adequacy.part import parse_stated, part_text, tree_of
     from selfcal.base.output import check_writable, write_text
     from selfcal.base.units import SENSORS
     from selfcal.logs.recording import list_of, load
@@ -50,11 +49,11 @@ def part(
     if not given and not datasheet:
         raise UserError("give a recording at rest, or numbers of a data sheet: --datasheet 'N=0.012deg/sqrt(h)'")
     check_writable(output, inputs=tuple(list_of(log)))
-    stated = [parse(text) for text in datasheet]
+    stated = [parse_stated(text) for text in datasheet]
     recording = load(log, sensors=(*SENSORS, *axes), **reading) if given else None
     tree, said = tree_of(recording, axes, stated, name, reading.get("rate"))
     model = Model.of_tree(tree, Path(output))
-    write_text(output, as_text(tree, recording, said))
+    write_text(output, part_text(tree, recording, said))
     return model
 
 

@@ -73,11 +73,11 @@ def plan(
     prior's sd.
     With `response`: the shortest record in which SHARE of the parts have a gain and a lag as wanted, its input switched
     between the `levels`. The document has `bit_s`, `duration_s` and `set_points` then.
-    Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond MOST bank samples, and the `curve`; the
+    Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond LENGTH_MOST, and the `curve`; the
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
     from selfcal.base.output import check_picture, check_writable, write_json
-    from selfcal.batch.plan import SCHEMA, Ensemble, Wish, cycling, picture, rates, refusal
+    from selfcal.batch.plan import SCHEMA, PlannedRecords, Wish, cycling, rates, refusal
     from selfcal.batch.spread import record_seeds
     from selfcal.diagnosis.separate import SHARE
     from selfcal.logs.recording import list_of
@@ -117,7 +117,7 @@ def plan(
             raise UserError(f"--want '{wish.text}': {reason}")
     seeds = record_seeds(records, seed)
     plain = replace(loaded, regressors=())
-    ensemble = Ensemble(plain, name, wishes, seeds, scheduler)
+    ensemble = PlannedRecords(plain, name, wishes, seeds, scheduler)
     lengths = [None if wish.parameter in columns else ensemble.length(k) for k, wish in enumerate(wishes)]
     samples = max((known for known in lengths if known is not None), default=round(RECORD_S * loaded.bank_rate_hz))
     entries = []
@@ -148,7 +148,9 @@ def plan(
     }
     write_json(document, json)
     if plot is not None:
-        picture(document, plot)
+        from selfcal.show.plots import plot_plan
+
+        plot_plan(document, plot)
     return document
 
 
@@ -191,7 +193,7 @@ def _response(
 ) -> dict[str, Any]:  # fmt: skip
     """The document of an input for `response`."""
     from selfcal.base.output import check_writable, write_json, write_text
-    from selfcal.batch.design import DRAWN, Experiment, designed
+    from selfcal.batch.design import TRIED_RECORDS, Experiment, designed
     from selfcal.batch.plan import SCHEMA, Wish
     from selfcal.batch.spread import record_seeds
     from selfcal.diagnosis.separate import SHARE
@@ -212,7 +214,7 @@ def _response(
     for wish in wishes:
         if wish.parameter not in sizes or not wish.text.endswith("%"):
             raise UserError(f"--want '{wish.text}': with --response takes 'gain within 5 %' and 'lag within 20 %'")
-    design = designed(model, axis, experiment, wishes, record_seeds(min(records, DRAWN), seed), scheduler)
+    design = designed(model, axis, experiment, wishes, record_seeds(min(records, TRIED_RECORDS), seed), scheduler)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "model": str(model.path),

@@ -49,16 +49,16 @@ def replay(
     from selfcal.adequacy.identify import chosen_axes
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, write_json
-    from selfcal.diagnosis.warm import load as load_start
+    from selfcal.diagnosis.warm import load_start
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
     from selfcal.model.regressors import from_time
-    from selfcal.readings.gate import table_of as gate_of
-    from selfcal.show.plot import plot_run
+    from selfcal.readings.gate import gate_of_recording as gate_of
     from selfcal.show.results import Identification
-    from selfcal.wire.frames import names_of
+    from selfcal.show.run_plot import plot_run
+    from selfcal.wire.frames import wire_names
     from selfcal.wire.on_wire import places, sent
-    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, document_of, run
+    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, run_firmware, wire_document
 
     if target not in TARGETS:
         raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
@@ -97,14 +97,14 @@ def replay(
     here = target == "host" and transport is None
     firmware = None if here else build(sent_model, recording.rate_hz, on_wire, target, start=known)
     how = transport or "slcan"
-    reports, said = run(firmware, rows, sent_model, on_wire, report_every, target, gate, how, channel, known)
+    reports, said = run_firmware(firmware, rows, sent_model, on_wire, report_every, target, gate, how, channel, known)
     history = {
         name: [replace(report, axis=name) for report in reports[sent_as]]
         for name, sent_as in taken.items()
         if sent_as in reports
     }
     why = {name: said[sent_as] for name, sent_as in taken.items() if sent_as in said}
-    document = document_of(recording, loaded_model, history, why, gate)
+    document = wire_document(recording, loaded_model, history, why, gate)
     add_sources(document, of_file, loaded_model)
     document["recording"] |= {"start_s": known_s, "since_power_on_s": since_power_on_s}
     write_json(document, json)
@@ -115,7 +115,7 @@ def replay(
         units = {name: recording.columns[name].unit for name in history}
         own = {name: loaded_model.group_of(name).unit for name in history}
         known_truth = truth if isinstance(truth, dict) else None
-        plot_run(history, plot, title, known_truth, units, names_of(loaded_model), sent_in=own)
+        plot_run(history, plot, title, known_truth, units, wire_names(loaded_model), sent_in=own)
         note(f"plot: {plot}")
     return Identification(document)
 

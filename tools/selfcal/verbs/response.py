@@ -37,19 +37,11 @@ def response(
     Returns the document `selfcal.response/1` and writes it to `json`; `plot` is of one input. Raises UserError for what
     the user can put right.
     """
-    from selfcal.adequacy.document import recording_entry
+    from selfcal.adequacy.identify_document import recording_entry
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.diagnosis.diagnose import BELOW_LATTICE
-    from selfcal.diagnosis.record import of_recording
-    from selfcal.diagnosis.response import (
-        LINES,
-        REFUSED_FROM,
-        SAMPLES_MOST,
-        SCHEMA,
-        answers_of,
-        inputs_of,
-        plot_response,
-    )
+    from selfcal.diagnosis.record import record_from
+    from selfcal.diagnosis.response import LINES, REFUSED_FROM, SAMPLES_MOST, SCHEMA, answers_of, inputs_of
     from selfcal.logs.recording import check_column, list_of, load
     from selfcal.model.file import Model
     from selfcal.readings.gate import gated
@@ -71,7 +63,7 @@ def response(
     rate_hz = min(recording.clock_of(name).rate_hz for name in axes)
     if decimate is None and recording.duration_s * rate_hz > SAMPLES_MOST:
         decimate = SAMPLES_MOST / recording.duration_s
-    record = of_recording(recording, loaded, decimate, axes)
+    record = record_from(recording, loaded, decimate, axes)
     for name in axes:
         if name not in record.axes:
             raise UserError(f"{recording.path}: {name}: {record.left_out[name]}")
@@ -104,6 +96,8 @@ def response(
         **(parts[0] if len(parts) == 1 else {"inputs": parts}),
     }
     if plot is not None:
+        from selfcal.show.plots import plot_response
+
         plot_response(document, plot)
     write_json(document, json)
     return document
@@ -111,9 +105,9 @@ def response(
 
 def show(document: dict[str, Any], given: Mapping[str, Any]) -> None:
     """Print the answer in a few lines. A signal that came ends the command here."""
-    from selfcal.base.ending import Held
+    from selfcal.base.ending import HeldSignals
     from selfcal.diagnosis.response import show as table
 
     for part in document.get("inputs", [document]):
         table({**document, **part}, to_stderr=to_stderr(given))
-    Held().check()
+    HeldSignals().check()

@@ -51,7 +51,7 @@ def simulate(
     from selfcal.base.output import check_place
     from selfcal.batch.spread import checked_seed
     from selfcal.diagnosis.causes import CAUSES
-    from selfcal.diagnosis.simulate import DRAWS, added_by, applied_to, axis_of, read_out, scene_of, slower, truth_of
+    from selfcal.diagnosis.simulate import SEEDS, added_by, applied_to, axis_of, put_faults, scene_of, slowed, truth_of
     from selfcal.logs import recording
     from selfcal.model.file import Model
     from selfcal.model.tables import bank_block
@@ -74,7 +74,7 @@ def simulate(
     with Console(stderr=True).status(f"simulating {scene.samples:,} samples of {len(axes)} axes"):
         added = added_by(applied, model, scene.rate_hz, seed)
         values, temperature, supply, present, bias_now = _reference.simulate(scene, axes, added)
-        changed = read_out(applied, model, axes, values, scene.rate_hz, _reference.Random(seed, DRAWS + len(axes)))
+        changed = put_faults(applied, model, axes, values, scene.rate_hz, _reference.Random(seed, SEEDS + len(axes)))
     for name, axis, now in zip(model.axes, axes, bias_now, strict=True):
         truth[name] |= {
             "bias_now": now,
@@ -94,7 +94,7 @@ def simulate(
     columns |= {"temp": ("degC", temperature[present]), "supply": ("V", supply[present])}
     stamps = None if present.all() else np.flatnonzero(present) / scene.rate_hz
     if changed is not None:
-        stamps, columns = slower(np.flatnonzero(present) / scene.rate_hz, columns, *changed)
+        stamps, columns = slowed(np.flatnonzero(present) / scene.rate_hz, columns, *changed)
     lattice = {name: axis.lsb for name, axis in zip(model.axes, axes, strict=True) if axis.lsb > 0.0}
     with Console(stderr=True).status(f"writing {scene.samples:,} samples"):
         recording.save(output, columns, scene.rate_hz, meta, t=stamps, lsb={**lattice, "supply": _reference.SUPPLY_LSB})

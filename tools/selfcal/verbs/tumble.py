@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 
 
 def tumble(
-    logs: Annotated[
-        Data,
-        argument(f"One log with turns, or a log a position: {READ}", "LOG...", kind=list[Path]),
-    ],
+    logs: Annotated[Data, argument(f"One log with turns, or a log a position: {READ}", "LOG...", kind=list[Path])],
     *,
     model: ModelFile = None,
     latitude: Annotated[
@@ -54,16 +51,15 @@ def tumble(
     from selfcal.batch.fail_on import INADEQUATE
     from selfcal.calibration import accelerometer, gyroscope
     from selfcal.calibration.earth import place
-    from selfcal.calibration.rests import MOST, tumble_of
-    from selfcal.calibration.tumble_document import document_of
-    from selfcal.calibration.tumble_export import FORMS, write
-    from selfcal.calibration.tumble_show import plot as picture
+    from selfcal.calibration.tumble_document import tumble_document
+    from selfcal.calibration.tumble_export import FORMS, write_calibration
+    from selfcal.calibration.tumble_rests import RESTS_MOST, tumble_of
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
 
     each = list(logs) if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
-    if not 1 <= len(each) <= MOST:
-        raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST} at most")
+    if not 1 <= len(each) <= RESTS_MOST:
+        raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {RESTS_MOST} at most")
     files = [path for log in each for path in list_of(log)]
     check_writable(json, plot, output, None if export is None else export[1], inputs=(*files, model))
     check_picture(plot)
@@ -82,11 +78,13 @@ def tumble(
             gyro = gyroscope.calibrate(accel)
         except UserError as error:
             failed = str(error)
-    document = document_of(recordings, accel, gyro or failed)
+    document = tumble_document(recordings, accel, gyro or failed)
     for form, file in ((("yaml", output),) if output is not None else ()) + ((export,) if export is not None else ()):
-        write(form, file, accel, gyro, document)
+        write_calibration(form, file, accel, gyro, document)
     if plot is not None:
-        picture(document, plot)
+        from selfcal.show.plots import plot_tumble
+
+        plot_tumble(document, plot)
     write_json(document, json)
     return document
 

@@ -17,16 +17,16 @@ from selfcal.base.units import factor
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 from selfcal.model.regressors import columns_of, offered
-from selfcal.wire.frames import AxisReport, names_of
+from selfcal.wire.frames import AxisReport, wire_names
 
 #: Time from a report to the middle of the readings that test it, and their length, s: white noise averages out.
 AHEAD_S, MEAN_S = 300.0, 60.0
 #: Fewest reports of a figure.
-LEAST = 3
+REPORTS_LEAST = 3
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownBias:
     """The bias at a time, s of the recording, and the coefficients [p] of the model's columns; 0 if not in use."""
 
     time_s: float
@@ -34,7 +34,7 @@ class Known:
     coefficients: Array
 
 
-def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence[Known]) -> dict[str, Any] | None:
+def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence[KnownBias]) -> dict[str, Any] | None:
     """Rms error of the corrected output AHEAD_S after a report, means of MEAN_S, in the recording's unit; None where
     too few reports have readings so long after them.
 
@@ -52,17 +52,17 @@ def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence
             continue
         change = columns[then].mean(axis=0) - columns[now[-1]]
         errors.append(float(np.nanmean(readings[then])) - report.bias - float(report.coefficients @ change))
-    if len(errors) < LEAST or not all(map(math.isfinite, errors)):
+    if len(errors) < REPORTS_LEAST or not all(map(math.isfinite, errors)):
         return None
     rmse = math.sqrt(float(np.mean(np.square(errors)))) * factor(group.unit, unit)
     return {"horizon_s": AHEAD_S, "mean_s": MEAN_S, "rmse": rmse, "reports": len(errors), "unit": unit}
 
 
-def of_report(report: AxisReport, model: Model) -> Known:
+def of_report(report: AxisReport, model: Model) -> KnownBias:
     """The state of an axis by a module's report: a column is in use where that is the likelier."""
-    stated = report.coefficients(names_of(model))
+    stated = report.coefficients(wire_names(model))
     sent = [
         stated.get(column, (0.0, 0.0, 0.0)) for regressor in offered(model, report.axis) for column in regressor.columns
     ]
     coefficients = np.array([mean if report.in_use(probability) else 0.0 for mean, _, probability in sent], np.float64)
-    return Known(report.time_s, report.value("bias_mean"), coefficients)
+    return KnownBias(report.time_s, report.value("bias_mean"), coefficients)

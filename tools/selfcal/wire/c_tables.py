@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from selfcal import _library32
+from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError, remark
 from selfcal.base.output import whole
-from selfcal.base.templates import of_code
 from selfcal.base.units import factor
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.file import NODES, NOT_HANDLED, Model
@@ -57,7 +57,7 @@ def bank_bytes(tables: Tables, axes: int = 0) -> int:
     return tables.nodes * (56 + 20 * axes + regressors) + tables.term_nodes * (104 + 24 * p + 40 * axes)
 
 
-def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
+def unused(model: Model, tables: Tables, target: str) -> Iterator[str]:
     """Parts of the model that have no effect."""
     yield from model.left_out
     measured = {name for name, axis in model.simulate.get("axes", {}).items() if "hypothesis" in axis}

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
+from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError, remark
-from selfcal.base.templates import of_code
 from selfcal.base.units import SENSOR_UNITS, parameter_unit
-from selfcal.model.file import MOST_COLUMNS, MOST_HYPOTHESES
+from selfcal.model.file import MOST_BANK_COLUMNS, MOST_HYPOTHESES
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -30,17 +30,15 @@ BASE, NODE_IDS, NODES = 0x200, 128, 12
 #: meaning is the item's.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 VALUE_BITS = COMMON["item"][0]
-#: Hypotheses and regressor columns that telemetry has room for: as many as a model.
-HYPOTHESES, COLUMNS = MOST_HYPOTHESES, MOST_COLUMNS
 #: Names of the places of a hypothesis' parameters where no model gives better ones.
 PLACE_NAMES = ("N", "p1", "p2")
 #: Signal of an axis's judgement whose words are those of every `reason_gx` to `reason_az`, too.
 REASON = "reason"
 #: Most letters of a name in a DBC file.
-LONGEST = 32
+LETTERS_MOST = 32
 
 
-class Written(NamedTuple):
+class DbcMessage(NamedTuple):
     """One message of the file, made from one of the pattern."""
 
     id: int
@@ -70,9 +68,9 @@ class Names:
 
 #: The names of the places.
 BY_PLACE = Names(
-    tuple(f"h{k}" for k in range(HYPOTHESES)),
-    (PLACE_NAMES,) * HYPOTHESES,
-    tuple((f"c{column}", "") for column in range(COLUMNS)),
+    tuple(f"h{k}" for k in range(MOST_HYPOTHESES)),
+    (PLACE_NAMES,) * MOST_HYPOTHESES,
+    tuple((f"c{column}", "") for column in range(MOST_BANK_COLUMNS)),
 )
 
 
@@ -145,7 +143,7 @@ def _coefficients(names: Names, reading: str) -> Callable[[Signal], Signal | Non
 def symbol(name: str) -> str:
     """A name as a DBC file may have it: letters, digits and underscores, none too long, a letter first."""
     plain = re.sub(r"\W", "_", name, flags=re.ASCII)
-    return (plain if plain[:1].isalpha() else f"_{plain}")[: LONGEST - len("_probability")]
+    return (plain if plain[:1].isalpha() else f"_{plain}")[: LETTERS_MOST - len("_probability")]
 
 
 def _different(names: Iterable[str]) -> list[str]:
@@ -159,7 +157,7 @@ def _different(names: Iterable[str]) -> list[str]:
     return symbols
 
 
-def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENSOR_UNITS)) -> str:
+def dbc_text(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENSOR_UNITS)) -> str:
     """The DBC file of a node, whose model has these names and axes. Messages of node 0 have no prefix; those of node 3
     begin with `M3_`, so that files of several nodes go together."""
     from cantools.database import load_file
@@ -167,7 +165,7 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENS
     pattern = cast("Database", load_file(PATTERN, sort_signals=None))
     reasons = pattern.get_message_by_name("GX_ADEQUACY").get_signal_by_name(REASON).choices
     prefix = f"M{node}_" if node else ""
-    messages: list[Written] = []
+    messages: list[DbcMessage] = []
 
     def same(signal: Signal) -> Signal:
         return _changed(signal, choices=reasons) if signal.name.startswith(f"{REASON}_") else signal
@@ -182,7 +180,7 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENS
             comment = comment.replace(theirs.replace("_", " "), ours)
         signals = [signal for signal in map(change, like.signals) if signal is not None]
         id_ = identifier(node, like.frame_id - BASE + more)
-        messages.append(Written(id_, prefix + (name or of), like.senders[0], signals, comment))
+        messages.append(DbcMessage(id_, prefix + (name or of), like.senders[0], signals, comment))
 
     add("STATUS")
     for axis in axes:
@@ -198,7 +196,8 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENS
         for k, hypothesis in enumerate(names.hypotheses):
             known_as = f"hypothesis {k}{f', {remark(hypothesis)}' if names.known else ''}"
             change = _hypothesis(names, k, unit)
-            add("GX_H0", f"{big}_{small[k].upper()}", change, HYPOTHESES * index + k, gx=axis, hypothesis_0=known_as)
+            place = MOST_HYPOTHESES * index + k
+            add("GX_H0", f"{big}_{small[k].upper()}", change, place, gx=axis, hypothesis_0=known_as)
     commented: set[tuple[str, str | None]] = set()
 
     def first_with(signal: Signal) -> bool:

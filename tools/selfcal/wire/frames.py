@@ -24,12 +24,12 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 
 from selfcal import _firmware, _library32
-from selfcal.bank.result import AxisResult, Estimate
-from selfcal.base.errors import UserError, called, few, install
+from selfcal.bank.axis_result import AxisResult, Estimate
+from selfcal.base.errors import UserError, called, few, install_line
 from selfcal.base.units import SENSOR_UNITS, SENSORS
 from selfcal.logs.framelog import LONGEST_FRAME, LONGEST_LINE
-from selfcal.model.file import Model
-from selfcal.wire.dbc_file import BASE, BY_PLACE, COMMON, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
+from selfcal.model.file import MOST_HYPOTHESES, Model
+from selfcal.wire.dbc_file import BASE, BY_PLACE, COMMON, NODE_IDS, NODES, PLACE_NAMES, Names
 
 if TYPE_CHECKING:
     import can
@@ -77,7 +77,7 @@ def axis_unit(axis: str) -> str:
     return SENSOR_UNITS[axis]
 
 
-def names_of(model: Model) -> Names:
+def wire_names(model: Model) -> Names:
     """The model's names of hypotheses, of their parameters by place, and of regressor columns.
 
     Place 0 is N, place 1 the drift parameter, place 2 the bandwidth or ratio."""
@@ -237,7 +237,7 @@ class AxisReport:
         change = None
         if {"change_count", "change", "change_size", "change_ago"} <= self.values.keys():
             count, size, ago_s = (self.values[f"change_{name}"] for name in ("count", "size", "ago"))
-            change = Change(word("change"), size, ago_s, int(count))
+            change = ModuleChange(word("change"), size, ago_s, int(count))
         span = self.values["temperature_span"]
         moved = span if math.isfinite(span) else None
         return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples, moved, change)
@@ -257,7 +257,7 @@ class AxisReport:
 
 
 @dataclass(frozen=True)
-class Change:
+class ModuleChange:
     """The last change that a module found and handled on an axis (lib/changes.c), and how many there were.
 
     `size`: of a step or a motion in the axis's unit, of a variance_change the noise over that before.
@@ -287,7 +287,7 @@ class Adequacy:
     score: float
     samples: int
     temperature_moved: float | None = None
-    change: Change | None = None
+    change: ModuleChange | None = None
 
     def __str__(self) -> str:
         changed = f"; {self.change}" if self.change is not None else ""
@@ -320,7 +320,7 @@ class _Kind:
 
 
 #: Parts of a report in their order, by what follows the axis in a message's name. The end follows them.
-_PARTS = ("", *(f"h{k}" for k in range(HYPOTHESES)), "coefficients", "adequacy")
+_PARTS = ("", *(f"h{k}" for k in range(MOST_HYPOTHESES)), "coefficients", "adequacy")
 
 
 @lru_cache(maxsize=1)
@@ -621,15 +621,15 @@ def _possible(kind: _Kind, signal: str, value: float) -> bool:
     if math.isnan(value):
         return kind.axis != ""
     if signal.endswith("probability"):
-        return 0.0 <= value <= 1.0 + HYPOTHESES * float(np.finfo(np.float32).eps)
+        return 0.0 <= value <= 1.0 + MOST_HYPOTHESES * float(np.finfo(np.float32).eps)
     if signal == "hypotheses":
-        return 1.0 <= value <= HYPOTHESES
+        return 1.0 <= value <= MOST_HYPOTHESES
     return math.isfinite(value) or (signal == "ln_evidence" and value < 0.0)
 
 
 def _whole(values: Mapping[str, float]) -> bool:
     """Whether all hypotheses that the module has are there, and no other, with a place N each."""
-    there = {k for k in range(HYPOTHESES) if f"h{k}_probability" in values}
+    there = {k for k in range(MOST_HYPOTHESES) if f"h{k}_probability" in values}
     wanted = ("h{}_ln_evidence_diff", "h{}_N_flags", "h{}_N_mean")
     all_there = there == set(range(int(values["hypotheses"])))
     return all_there and all(name.format(k) in values for k in there for name in wanted)
@@ -807,7 +807,7 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
     if interface in ("slcan", "serial"):
         _check_port(interface, channel)
     if interface == "udp_multicast" and find_spec("msgpack") is None:
-        raise UserError(f"{interface}: msgpack is not installed: {install('selfcal[multicast]')}")
+        raise UserError(f"{interface}: msgpack is not installed: {install_line('selfcal[multicast]')}")
     try:
         bus = can.Bus(interface=interface, channel=channel, **options)
     except Exception as error:  # python-can's drivers raise what the libraries below them raise

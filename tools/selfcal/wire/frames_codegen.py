@@ -14,10 +14,11 @@ from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 from jinja2 import Template
 
+from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError
-from selfcal.base.templates import of_code
 from selfcal.logs.framelog import LONGEST_FRAME
-from selfcal.wire.dbc_file import COLUMNS, COMMON, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, REASON, VALUE_BITS, dbc
+from selfcal.model.file import MOST_BANK_COLUMNS, MOST_HYPOTHESES
+from selfcal.wire.dbc_file import COMMON, NODE_IDS, NODES, PLACE_NAMES, REASON, VALUE_BITS, dbc_text
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, TUMBLE, load_dbc
 
 #: Messages of an axis, by what follows its name, and the name of their items in C; alike for all axes.
@@ -93,7 +94,7 @@ def header(database: Database) -> str:
     """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack: messages of other axes
     and hypotheses are made from the first one's (dbc_file.py)."""
     columns = [_item(signal) for signal in fields(_first(database, "_COEFFICIENTS"))]
-    if columns != list(range(3 * COLUMNS)):
+    if columns != list(range(3 * MOST_BANK_COLUMNS)):
         raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")
     status, corrected, command, answer, tumble = map(
         database.get_message_by_name, (STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE)
@@ -108,7 +109,7 @@ def header(database: Database) -> str:
         "later_of": lambda message: any(LATER.match(signal.name) for signal in fields(message)),
         "choices_of": _choices,
         "COMMON": COMMON,
-        **{"NODES": NODES, "NODE_IDS": NODE_IDS, "AXES": AXES, "HYPOTHESES": HYPOTHESES},
+        **{"NODES": NODES, "NODE_IDS": NODE_IDS, "AXES": AXES, "HYPOTHESES": MOST_HYPOTHESES},
         "PLACES": len(PLACE_NAMES),
         "STATISTICS": STATISTICS,
     }
@@ -128,7 +129,7 @@ def table(database: Database) -> str:
     for suffix in OF_AXIS:
         first, *_, last = of_axes = [database.get_message_by_name(axis.upper() + suffix) for axis in AXES]
         ids = ", ".join(f"`0x{message.frame_id:X}` {message.name}" for message in of_axes)
-        more = f"; `_H1` to `_H{HYPOTHESES - 1}` follow each" if suffix == "_H0" else ""
+        more = f"; `_H1` to `_H{MOST_HYPOTHESES - 1}` follow each" if suffix == "_H0" else ""
         units = {signal.name: signal.unit for signal in fields(last)}
         messages.append((HEADINGS[suffix], ids + more, fields(first), units))
     for message in map(database.get_message_by_name, (STATUS, CORRECTED, ANSWER, TUMBLE)):
@@ -161,6 +162,6 @@ def page(text: str, database: Database) -> str:
 
 if __name__ == "__main__":
     wire = ROOT / "lib" / "WIRE.md"
-    (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")  # first: the others are made from it
+    (ROOT / "lib" / "selfcal.dbc").write_text(dbc_text(), encoding="utf-8")  # first: the others are made from it
     wire.write_text(page(wire.read_text(encoding="utf-8"), load_dbc()), encoding="utf-8")
     (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")

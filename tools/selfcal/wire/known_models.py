@@ -10,12 +10,11 @@ from itertools import combinations
 from pathlib import Path
 
 from selfcal.base.errors import UserError
-from selfcal.diagnosis.warm import Start, warmed
-from selfcal.diagnosis.warm import load as load_start
+from selfcal.diagnosis.warm import Start, load_start, warmed
 from selfcal.model.file import Model
 from selfcal.model.tables import make_tables
 from selfcal.wire.dbc_file import BY_PLACE, Names
-from selfcal.wire.frames import AXES, names_of
+from selfcal.wire.frames import AXES, wire_names
 
 
 class KnownModels:
@@ -44,7 +43,7 @@ class KnownModels:
         for model in self.models:
             start = self._start if model is self.models[0] else None
             if int(model_id) in _ids(model, start, interval_s, int(block)):
-                return names_of(model)
+                return wire_names(model)
         return BY_PLACE
 
 

@@ -126,7 +126,7 @@ def patient() -> Iterator[None]:
             sys.stderr = before
 
 
-class Source(Protocol):
+class FrameSource(Protocol):
     """Where frames come from."""
 
     @property
@@ -176,7 +176,7 @@ class Contact:
 
 
 @dataclass
-class Module:
+class LiveModule:
     """One module that is heard: its last report of each axis with the last biases, and the module time then, s."""
 
     decoder: Decoder
@@ -209,7 +209,7 @@ class View:
     """
 
     heard: Streams | Decoder
-    source: Source
+    source: FrameSource
     title: str
     total_s: float | None = None
     contact: Contact | None = None
@@ -220,7 +220,7 @@ class View:
 
     def __post_init__(self) -> None:
         self.streams = Streams.of(self.heard) if isinstance(self.heard, Decoder) else self.heard
-        self._modules: dict[int, Module] = {}
+        self._modules: dict[int, LiveModule] = {}
         self._console = Console(stderr=True)
         self._live = Live(
             get_renderable=self.renderable,
@@ -241,10 +241,10 @@ class View:
                 trend.append(report.value("bias_mean"))
                 last[report.axis] = report, trend
 
-    def _module(self, node: int) -> Module:
-        return self._modules.setdefault(node, Module(self.streams.decoders[node]))
+    def _module(self, node: int) -> LiveModule:
+        return self._modules.setdefault(node, LiveModule(self.streams.decoders[node]))
 
-    def _contact_of(self, module: Module | None) -> Contact | None:
+    def _contact_of(self, module: LiveModule | None) -> Contact | None:
         return self.contact if module is None else self.contacts.get(module.decoder.node, self.contact)
 
     def __enter__(self) -> View:
@@ -285,7 +285,7 @@ class View:
             parts.append(_line(Text(f"all {said}" if modules else said, "dim")))
         return Group(*parts)
 
-    def _verdict(self, modules: Mapping[int, Module]) -> Text:
+    def _verdict(self, modules: Mapping[int, LiveModule]) -> Text:
         """How many axes are calibrated, the age of the oldest report, and the next thing to do."""
         axes, ready, oldest_s, step = 0, 0, 0.0, ""
         for node, module in modules.items():
@@ -309,7 +309,7 @@ class View:
         step = step or ("nothing to do" if done else "wait for reports")
         return Text(f"{said}, {step}", "green" if done else "yellow")
 
-    def _next_step(self, module: Module, shown: Sequence[str]) -> str:
+    def _next_step(self, module: LiveModule, shown: Sequence[str]) -> str:
         """The next step for a module; "" without one."""
         contact, status = self._contact_of(module), module.decoder.status
         if wrong := module.decoder.foreign or module.decoder.twins:
@@ -327,7 +327,7 @@ class View:
         names = ", ".join(axis for axis, reason in why.items() if reason == word)
         return f"{names}: {REASONS.get(word, word)}" if word else ""
 
-    def _lines(self, module: Module, width: int, height: int | None) -> list[Text]:
+    def _lines(self, module: LiveModule, width: int, height: int | None) -> list[Text]:
         """The lines of a module below its title, `height` at most."""
         foreign = module.decoder.foreign
         if foreign:
@@ -363,7 +363,7 @@ class View:
         said = f"temperature has moved {moved:.1f} of the {TEMPERATURE_NEEDED:g} degC that a temperature law needs"
         return [_line(Text(said, "dim"))]
 
-    def _unreported(self, module: Module, last: Mapping[str, object], width: int) -> list[Text]:
+    def _unreported(self, module: LiveModule, last: Mapping[str, object], width: int) -> list[Text]:
         """Why axes have no report, a line for each reason."""
         axes: dict[str, list[str]] = {}
         for axis, word in module.reasons.items():
@@ -377,17 +377,17 @@ class View:
             )
         ]
 
-    def _counts(self, module: Module) -> Text:
+    def _counts(self, module: LiveModule) -> Text:
         """The frames of a module, and of strangers if it is alone."""
         whole = len(self.streams.known) == 1
         said = frame_counts(self.streams, self.source) if whole else counted(module.decoder.statistics)
         return _line(Text(said, "dim"))
 
-    def _title_of(self, name: str, module: Module | None) -> Text:
+    def _title_of(self, name: str, module: LiveModule | None) -> Text:
         time_s = module.now() if module is not None else 0.0
         return Text.assemble((f"{name}   module time {time_s:.1f} s   ", "bold"), self._state(module))
 
-    def _state(self, module: Module | None) -> Text:
+    def _state(self, module: LiveModule | None) -> Text:
         """State of the module, as far as it is heard."""
         contact = self._contact_of(module)
         status = module.decoder.status if module is not None else {}
@@ -403,7 +403,7 @@ class View:
         end = contact is None and self.total_s is None and self.source.closed
         return Text(f"{said}, end of the log" if end else said, "bold")
 
-    def _status(self, module: Module, width: int) -> list[Text]:
+    def _status(self, module: LiveModule, width: int) -> list[Text]:
         """What the status says that is not 0, by its signals' names (port/README.md); trouble first."""
         said: list[Text] = []
         for name, value in list(module.decoder.status.items()):
@@ -415,7 +415,7 @@ class View:
 
     def _blocks(
         self,
-        module: Module,
+        module: LiveModule,
         last: Mapping[str, tuple[AxisReport, Sequence[float]]],
         names: Names,
         hypotheses: int,
@@ -472,7 +472,7 @@ def counted(s: Statistics) -> str:
     return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused{foreign}"
 
 
-def frame_counts(streams: Streams | Decoder, source: Source) -> str:
+def frame_counts(streams: Streams | Decoder, source: FrameSource) -> str:
     """A line on the fate of all frames."""
     return f"{counted(streams.statistics)}, {source.malformed} malformed"
 

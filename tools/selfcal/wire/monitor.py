@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
 from selfcal.adequacy.checks import Judged
-from selfcal.adequacy.document import Identified, to_document
-from selfcal.base.ending import Held
+from selfcal.adequacy.identify_document import Identified, identify_document
+from selfcal.base.ending import HeldSignals
 from selfcal.base.errors import UserError
 from selfcal.logs.framelog import FrameLog
 from selfcal.wire.dbc_file import Names
@@ -29,7 +29,7 @@ from selfcal.wire.frames import (
 )
 from selfcal.wire.known_models import KnownModels
 from selfcal.wire.live import SILENT_S, Contact, View
-from selfcal.wire.streams import Stream, content
+from selfcal.wire.streams import Stream, report_content
 
 if TYPE_CHECKING:
     import can
@@ -39,7 +39,7 @@ MODULES = "selfcal.modules/1"
 
 
 @dataclass
-class Outcome(Statistics):
+class MonitorOutcome(Statistics):
     """The frames, and whether the module was out of reach when the time was up or its port went.
 
     An end that the user asked for does not count. `twins`: two modules send as one node.
@@ -68,7 +68,7 @@ class Run:
     opened_s: float = field(default_factory=time.monotonic)
     came_s: float = field(default_factory=time.time)
 
-    def listen(self, view: View, ending: Held, end_s: float, once: bool) -> None:
+    def listen(self, view: View, ending: HeldSignals, end_s: float, once: bool) -> None:
         """Take frames until a signal, `end_s` of time.monotonic(), the source's end, or until all nodes are foreign. A
         port that vanishes is waited for, unless `once`."""
         while not ending.asked and (left_s := end_s - time.monotonic()) > 0.0:
@@ -127,7 +127,7 @@ class Run:
     def pass_on(self, reports: Sequence[AxisReport]) -> None:
         """Give reports to the programs that listen, and to the log."""
         for report in self._chosen(reports):
-            entry = content(report, self.models.names(self.streams.decoders[report.node].status))
+            entry = report_content(report, self.models.names(self.streams.decoders[report.node].status))
             for sink in self.sinks:
                 sink.send(entry, self.came_s)
             if self.writer is not None:
@@ -221,7 +221,7 @@ def document(
         axis: Identified(axis_unit(axis), axis_unit(axis), reports[-1].result(names), Judged({}, None), {})
         for axis, reports in history.items()
     }
-    document = to_document(run, identified)
+    document = identify_document(run, identified)
     document["node"] = node
     for axis, entry in document["axes"].items():
         report = history[axis][-1]

@@ -24,15 +24,15 @@ import numpy as np
 from rich.console import Console
 
 from selfcal.adequacy.checks import Judged
-from selfcal.adequacy.document import Identified, as_typed, to_document
 from selfcal.adequacy.identify import Fed, concluded, may_act, with_reasons
+from selfcal.adequacy.identify_document import Identified, as_typed, identify_document
 from selfcal.adequacy.one_over_f import with_white
 from selfcal.adequacy.summary import summarize
+from selfcal.bank.axis_result import AxisResult, in_unit
 from selfcal.bank.blocks import usable_blocks
 from selfcal.bank.firmware import Played
-from selfcal.bank.result import AxisResult, in_unit
-from selfcal.bank.subsets import Inclusion, Scored, normal_coefficient
-from selfcal.base.ending import held
+from selfcal.bank.subsets import Inclusion, ScoredSubsets, normal_coefficient
+from selfcal.base.ending import hold_signals
 from selfcal.base.errors import OutsidePriors, UserError, called, note
 from selfcal.base.units import factor as factor_of
 from selfcal.base.units import same_kind
@@ -44,7 +44,7 @@ from selfcal.model.tables import Tables, bank_block, make_tables
 from selfcal.readings.readings import look
 from selfcal.wire.ahead import error_ahead, of_report
 from selfcal.wire.c_tables import check_forms, write_tables
-from selfcal.wire.frames import AXES, ROOT, TREE, AxisReport, Decoder, Link, names_of, open_bus, reasons
+from selfcal.wire.frames import AXES, ROOT, TREE, AxisReport, Decoder, Link, open_bus, reasons, wire_names
 from selfcal.wire.live import SILENT_S, View, frame_counts
 
 MAGIC = b"SELFCAL2"
@@ -95,7 +95,7 @@ TARGETS = {
 }
 
 
-def tables_of(model: Model, rate_hz: float, axes: Sequence[str], target: str, start: Start | None) -> Tables:
+def firmware_tables(model: Model, rate_hz: float, axes: Sequence[str], target: str, start: Start | None) -> Tables:
     """Tables of a firmware, with measured priors from `start`."""
     return warmed(make_tables(model, rate_hz, tuple(axes), target), start)
 
@@ -117,7 +117,7 @@ def build(
     made_by = TARGETS[target]
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         tables = Path(name)
-        made = tables_of(model, rate_hz, axes, nodes or target, start)
+        made = firmware_tables(model, rate_hz, axes, nodes or target, start)
         write_tables(model, made, tables, nodes or target, start.of if start is not None else "")
         key = _content(tables, made_by.make)
         root = workshop()
@@ -230,7 +230,7 @@ def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Pa
         file.write(rows.tobytes())
 
 
-def run(
+def run_firmware(
     firmware: Path | None,
     recording: Recording,
     model: Model,
@@ -255,7 +255,7 @@ def run(
         write_rows(recording, model, axes, rows)
         watch = partial(_watch, decoder=decoder, recording=recording, model=model, history=history)
         if firmware is None:
-            tables = tables_of(model, recording.rate_hz, axes, "host", start)
+            tables = firmware_tables(model, recording.rate_hz, axes, "host", start)
             try:
                 watch(Played(model, tables, rows, ms(period_s), gate))
             except ValueError as error:  # std::invalid_argument
@@ -334,7 +334,7 @@ def running(
         else:  # QEMU takes over a socket that listens already, so no port can be lost to another program
             uart = f"socket,id=uart,server=on,wait=off,fd={server.fileno()}"
             command = emulator(firmware, rows.name, period_s, target, uart, gate)
-        with held() as ending:  # a signal between start and `try` would leave it running
+        with hold_signals() as ending:  # a signal between start and `try` would leave it running
             leash, end_of_leash = os.pipe()  # its end closes with this process, whatever ends that
             try:
                 module = subprocess.Popen(
@@ -395,7 +395,7 @@ def _watch(
     are taken out. `module`: its program, if it has one."""
     whole: dict[str, bool] = {}  # the axis's last report
     title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
-    with View(decoder, link, title, recording.duration_s, names=lambda status: names_of(model)) as view:
+    with View(decoder, link, title, recording.duration_s, names=lambda status: wire_names(model)) as view:
         heard = time.monotonic()
         while not decoder.finished:
             frame = link.recv(1.0)
@@ -431,12 +431,8 @@ def _watch(
     Console(stderr=True).print(said, highlight=False, soft_wrap=True)
 
 
-def document_of(
-    recording: Recording,
-    model: Model,
-    history: Mapping[str, Sequence[AxisReport]],
-    why: Mapping[str, str],
-    gate: bool,
+def wire_document(
+    recording: Recording, model: Model, history: Mapping[str, Sequence[AxisReport]], why: Mapping[str, str], gate: bool
 ) -> dict[str, Any]:
     """The document `selfcal.identify/1` of what telemetry carried."""
     identified: dict[str, Identified | UserError] = {}
@@ -446,7 +442,7 @@ def document_of(
         except UserError as error:
             identified[name] = error
     with_reasons(identified, recording, model)
-    document = to_document(recording, identified)
+    document = identify_document(recording, identified)
     again = f"{called()} diagnose {as_typed(document['recording'])}"
     for name, axis in document["axes"].items():
         axis["module_reason"] = why.get(name)
@@ -493,16 +489,16 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
 
 def _with_coefficients(
     report: AxisReport, model: Model, regressors: Choice, unit: str
-) -> tuple[AxisResult, Scored | None]:
+) -> tuple[AxisResult, ScoredSubsets | None]:
     """The report in the model's unit, and its regressors with coefficients per `unit`, the recording's.
 
     The firmware compares no regressor with all that the axis has, and sends the likelier of the two. The evidence here
     is over both, weighed by their priors, as `identify` weighs all subsets.
     """
-    result = report.result(names_of(model))
+    result = report.result(wire_names(model))
     if not regressors:
         return result, None
-    coefficients = report.coefficients(names_of(model))
+    coefficients = report.coefficients(wire_names(model))
     columns = [column for regressor in regressors for column in regressor.columns]
     probability = coefficients[columns[0]][2] if columns[0] in coefficients else 0.0
     if not math.isfinite(probability):
@@ -528,4 +524,4 @@ def _with_coefficients(
     share = ln_prior(regressors, choices[used]) - math.log(max(probability, 1.0 - probability))
     evidence = {law: value + share for law, value in result.log_evidence.items()}
     result = replace(result, log_evidence=evidence)
-    return result, Scored(result, inclusion, choices, (1.0 - probability, probability), int(used))
+    return result, ScoredSubsets(result, inclusion, choices, (1.0 - probability, probability), int(used))

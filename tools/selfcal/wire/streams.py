@@ -20,8 +20,8 @@ from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 from urllib.parse import urlsplit
 
-from selfcal.base.ending import Held
-from selfcal.base.errors import UserError, install
+from selfcal.base.ending import HeldSignals
+from selfcal.base.errors import UserError, install_line
 from selfcal.base.limits import MOST_RATE_HZ
 from selfcal.base.output import finite
 from selfcal.base.units import parameter_unit
@@ -46,13 +46,13 @@ class Stream(Protocol):
     """Where reports go."""
 
     def send(self, report: Mapping[str, Any], at_s: float) -> None:
-        """Take what `content` made of a report, that came at `at_s`, s since 1970."""
+        """Take what `report_content` made of a report, that came at `at_s`, s since 1970."""
 
     def close(self) -> None:
         """No more will come."""
 
 
-def content(report: AxisReport, names: Names) -> dict[str, Any]:
+def report_content(report: AxisReport, names: Names) -> dict[str, Any]:
     """A report as JSON has it, by the module's `names`; values that did not arrive are absent, NaN is null."""
     v, unit = report.values, axis_unit(report.axis)
     entry: dict[str, Any] = {
@@ -143,7 +143,7 @@ class _Lines:
         while data:
             if select.select([], [stdout], [], 0.25)[1]:
                 data = data[os.write(stdout, data[: select.PIPE_BUF]) :]
-            elif Held().asked:
+            elif HeldSignals().asked:
                 return
 
     def close(self) -> None:
@@ -175,7 +175,7 @@ class _Foxglove:
         try:
             import foxglove
         except ImportError as error:
-            typed = install("selfcal[foxglove]")
+            typed = install_line("selfcal[foxglove]")
             raise UserError(f"--stream foxglove: foxglove-sdk is not installed: {typed}") from error
         self._context = foxglove.Context()
         self._channels: dict[str, foxglove.Channel] = {}
@@ -198,7 +198,7 @@ class _Foxglove:
         self._server.stop()
 
 
-def check(wanted: str) -> tuple[str, str, int]:
+def check_stream(wanted: str) -> tuple[str, str, int]:
     """Kind, host and port of an option `KIND[:HOST:PORT]`; of `ros:HZ` the rate in place of a port. Raises
     UserError."""
     kind, _, where = wanted.partition(":")
@@ -221,7 +221,7 @@ def open_streams(wanted: Sequence[str], stack: ExitStack) -> list[Stream]:
     """The streams of `--stream`, closed with the `stack`. Raises UserError."""
     sinks: list[Stream] = []
     for stream in wanted:
-        kind, host, port = check(stream)
+        kind, host, port = check_stream(stream)
         if kind in LINES:
             sinks.append(_Lines() if kind == "jsonl" else _Ros(port))
         else:

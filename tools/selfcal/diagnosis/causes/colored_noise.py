@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Simulated, Written, shown
 from selfcal.diagnosis.causes import quantization_noise
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, best
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, interval, net
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, net, normal_entry
 from selfcal.model.file import Model
 from selfcal.model.laws import RATIO_LIMITS
 
@@ -50,7 +50,7 @@ def looks(state: State, record: Record) -> list[Look]:
 def _sizes(chosen: Fit) -> dict[str, Any]:
     m = math.tanh(chosen.value("color"))
     lag1 = m / (1.0 + m * m) if chosen.terms.color == "ma" else m
-    return {"lag1": interval(lag1, (1.0 - lag1 * lag1) / math.sqrt(chosen.n), "1")}
+    return {"lag1": normal_entry(lag1, (1.0 - lag1 * lag1) / math.sqrt(chosen.n), "1")}
 
 
 def _extend(at: Extension) -> None:

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis import forms, hidden
+from selfcal.base.grid import Array
+from selfcal.diagnosis import channel_looks, hidden
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Simulated, Written, shown, sized
+from selfcal.diagnosis.channel_looks import Channel, form_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.forms import Channel, form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.joint import WIDTHS, act_apart
+from selfcal.likelihood.joint import SIZE_WIDTHS, act_apart
 from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.model.forms import formed
 from selfcal.model.regressors import coefficient_unit
@@ -30,7 +30,7 @@ RATE_WINDOWS_S = (0.0, 5.0, 20.0, 60.0, 150.0)
 def looks(state: State, record: Record) -> list[Look]:
     """One look for every other axis."""
     others = {name: values for name, values in record.other_axes(state.axis).items() if np.ptp(values) > 0.0}
-    return forms.look(state, [_channel(record, name, values) for name, values in others.items()])
+    return channel_looks.look(state, [_channel(record, name, values) for name, values in others.items()])
 
 
 def _channel(record: Record, name: str, values: Array) -> Channel:
@@ -65,9 +65,9 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
         back = pairs.get((other, name))
         if back is None:  # the other one may follow by a lag or a rate alone
             source = found[other].state if other in found else record.axes[other]
-            known = source.best.ln_likelihood - without(source, name).best.ln_likelihood
+            known = source.best.ln_likelihood - without_axis(source, name).best.ln_likelihood
             if known > finding.look.gain - ALIKE:
-                _drop(found[name], other, without(found[name].state, other))
+                _drop(found[name], other, without_axis(found[name].state, other))
             continue
         ahead: float = back.look.gain - finding.look.gain
         if abs(ahead) < ALIKE:
@@ -76,7 +76,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
             sizes = [abs(float(side.look.estimate["coefficient"]["median"])) for side in (finding, back)]
             ahead = sizes[0] - sizes[1]
         if ahead > 0.0:
-            _drop(found[name], other, without(found[name].state, other))
+            _drop(found[name], other, without_axis(found[name].state, other))
     arms: dict[str, set[str]] = {}
     for name, other, _ in leaks(found):
         arms.setdefault(other, set()).add(name)
@@ -135,11 +135,11 @@ def _arms(record: Record, found: Mapping[str, Diagnosed]) -> None:
     for _, other, finding in leaks(found):
         gains[other] = gains.get(other, 0.0) + finding.look.gain
     source = max(gains, key=lambda name: gains[name], default="")
-    free = {name: without(axis.state, source) for name, axis in found.items() if name != source}
+    free = {name: without_axis(axis.state, source) for name, axis in found.items() if name != source}
     if len(free) < 2 or gains[source] < NET_LEAST:
         return
     columns = {name: record.other_axes(name)[source] for name in free}
-    each = [free[name].bayes(columns[name], np.array(WIDTHS)) for name in free]
+    each = [free[name].bayes(columns[name], np.array(SIZE_WIDTHS)) for name in free]
     star = act_apart(*map(np.array, zip(*each, strict=True)))
     names = [[*free][k] for k in star.axes]
     if len(names) < 2 or star.evidence - math.log(len(gains)) < EVIDENT:
@@ -148,7 +148,7 @@ def _arms(record: Record, found: Mapping[str, Diagnosed]) -> None:
     if quantity is not None and quantity.explains(source, names):
         return
     for name in {*names} - {name for name, other, _ in leaks(found) if other == source}:
-        for look in forms.look(free[name], [_channel(record, source, columns[name])])[:1]:
+        for look in channel_looks.look(free[name], [_channel(record, source, columns[name])])[:1]:
             after = free[name].refit(**look.changes)
             found[name].findings.append(Finding(look, 0, free[name], after))
             found[name].state = after
@@ -161,8 +161,8 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> None:
         source = found[other].state if other in found else record.axes[other]
         if all(column.cause == "cross_axis" for column in source.regressors):
             continue
-        source, free = without(source, name), without(found[name].state, other)
-        rest = forms.look(free, [_channel(record, other, bridged(source.rest))])
+        source, free = without_axis(source, name), without_axis(found[name].state, other)
+        rest = channel_looks.look(free, [_channel(record, other, bridged(source.rest))])
         if not any(look.net >= NET_LEAST for look in rest):
             _drop(found[name], other, free)
 
@@ -187,8 +187,8 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
         if partners[name] <= partners[other] or other not in found:
             continue
         axis, source = found[name], found[other]
-        free = without(axis.state, other)
-        back = forms.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
+        free = without_axis(axis.state, other)
+        back = channel_looks.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
         lost = axis.state.best.ln_likelihood - free.best.ln_likelihood
         if back and back[0].gain > lost - ALIKE:  # of the pair that is shown already, the likelier source
             _drop(axis, other, free)
@@ -208,9 +208,9 @@ def _source_shown(
     follow a third.
     """
     final = found[name].state
-    free = without(final, other)
+    free = without_axis(final, other)
     ahead = final.best.ln_likelihood - free.best.ln_likelihood
-    source = without(found[other].state if other in found else record.axes[other], name)
+    source = without_axis(found[other].state if other in found else record.axes[other], name)
     back = source.with_columns(record.other_axes(other)[name])[0]
     lagged = [finding for finding in findings if "lag_s" in finding.look.estimate]
     return ahead - back > ALIKE and all(_is_late(final, finding, record.other_axes(name)[other]) for finding in lagged)
@@ -226,7 +226,7 @@ def _is_late(final: State, finding: Finding, values: Array) -> bool:
     return final.best.ln_likelihood - instead > ALIKE and both - final.best.ln_likelihood < ALIKE
 
 
-def without(state: State, other: str) -> State:
+def without_axis(state: State, other: str) -> State:
     """The state without the columns of another axis."""
     kept = tuple(
         regressor
@@ -269,11 +269,11 @@ CAUSE = Cause(
         piece=lambda look, axes, jumps: look.estimate["other"] in axes and look.estimate.get("source") == hidden.ID,
         settle=_settle,
     ),
-    written=Written(entry=_entry, of_column=forms.of_other),
+    written=Written(entry=_entry, of_column=channel_looks.of_other),
     simulated=Simulated(
-        keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient"), **forms.EFFECT_KEYS},
+        keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient"), **channel_looks.EFFECT_KEYS},
         follows=True,
-        of_estimate=forms.of_look,
-        add=lambda keys, channels: forms.added(keys, channels, channels.axes[str(keys["other"])]),
+        of_estimate=channel_looks.of_look,
+        add=lambda keys, channels: channel_looks.added(keys, channels, channels.axes[str(keys["other"])]),
     ),
 )

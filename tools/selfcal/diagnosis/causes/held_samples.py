@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from selfcal._reference import Random
-from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, counted, medians, positive
+from selfcal.base.grid import Array
+from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, count_key, medians, positive
 from selfcal.likelihood.state import Look
-from selfcal.likelihood.statemodel import Array
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:
@@ -46,7 +46,7 @@ CAUSE = Cause(
     grouping=Grouping(alike=lambda a, b: True),
     score=Scored(no_gain="repeats are left out before and after"),
     simulated=Simulated(
-        keys={"rate_hz": positive(lambda s: 0.2 * s.samples / s.duration_s), "intervals": counted(None)},
+        keys={"rate_hz": positive(lambda s: 0.2 * s.samples / s.duration_s), "intervals": count_key(None)},
         of_estimate=_of_estimate,
         spoil=_spoil,
     ),

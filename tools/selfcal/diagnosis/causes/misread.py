@@ -1,4 +1,4 @@
-"""Readings that a map of the firmware or the logger has changed: readings/misread.py finds which."""
+"""Readings that a map of the firmware or the logger has changed: readings/changed_words.py finds which."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, counted, medians, shown
+from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, count_key, medians, shown
 
 #: Missing samples are told of from this share on.
 MISSING_LEAST = 1e-3
@@ -17,7 +17,7 @@ CAUSE = Cause(
     grouping=Grouping(alike=lambda a, b: True),
     score=Scored(no_gain="gaps are bridged before and after: the model of the noise is the same"),
     simulated=Simulated(
-        keys={"missing": counted(lambda s: max(1, round(0.02 * s.samples)), "missing")},
+        keys={"missing": count_key(lambda s: max(1, round(0.02 * s.samples)), "missing")},
         common=True,
         of_estimate=lambda look: {key: max(1, round(value)) for key, value in medians(look).items()},
     ),

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, counted, shown
+from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, count_key, shown
 from selfcal.likelihood.state import Look
-from selfcal.readings.motion import Moved, events_of
+from selfcal.readings.moves import Moved, motion_events
 
 
 def look_of(moved: Moved) -> Look:
@@ -19,7 +19,7 @@ def look_of(moved: Moved) -> Look:
 
 def _meet(a: Look, b: Look) -> bool:
     """Whether two axes moved at one time."""
-    return len(events_of({"a": a.estimate["intervals"], "b": b.estimate["intervals"]})) == 1
+    return len(motion_events({"a": a.estimate["intervals"], "b": b.estimate["intervals"]})) == 1
 
 
 def _seconds(value: float) -> str:
@@ -40,7 +40,7 @@ CAUSE = Cause(
     score=Scored(once="motion is an event of its recording"),
     simulated=Simulated(
         keys={
-            "intervals": counted(lambda s: 5, "motion_intervals"),
+            "intervals": count_key(lambda s: 5, "motion_intervals"),
             "amplitude": Key(lambda s: 20.0 * s.sd, "motion_amplitude"),
         },
         of_estimate=_of_estimate,

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis import swing
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Key, Simulated, Written, positive, shown
 from selfcal.diagnosis.causes import periodic
@@ -22,13 +23,13 @@ from selfcal.diagnosis.statistics import states_of
 from selfcal.diagnosis.swing import Swing
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import ALIKE, Look, State, net, of_parameter
-from selfcal.likelihood.statemodel import PERIOD_LIMITS, Array, Matrices
+from selfcal.likelihood.statemodel import PERIOD_LIMITS, Matrices
 from selfcal.model.file import Model
 from selfcal.model.laws import DAMPING_LIMITS, RATIO_LIMITS
 from selfcal.model.laws import swing as turned
 
 #: The prior of the size in the model file, over the size found.
-RATIOS = (0.1, 10.0)
+SIZE_RATIOS = (0.1, 10.0)
 
 
 def looks(state: State, record: Record) -> list[Look]:
@@ -92,7 +93,7 @@ def _extend(at: Extension) -> None:
     walk = next(fit for fit in final.fits if fit.terms.walk)
     K = max(walk.K, 2.0 * float(at.group["priors"]["K"]["min"]))
     ratio = estimate["sd"]["median"] * math.sqrt(w) / K
-    low, high = (min(max(by * ratio, RATIO_LIMITS[0]), RATIO_LIMITS[1]) for by in RATIOS)
+    low, high = (min(max(by * ratio, RATIO_LIMITS[0]), RATIO_LIMITS[1]) for by in SIZE_RATIOS)
     term = {
         "kind": "oscillation",
         "period_s": digits(period["median"]),

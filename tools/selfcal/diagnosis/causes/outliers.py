@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Scored, Simulated, Written, shown
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import run
-from selfcal.likelihood.state import NET_LEAST, Look, State, interval, net
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import NET_LEAST, Look, State, net, normal_entry
 
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The two numbers of a mixture are at their limits in
 #: most of them: 5 instead of 1350 / e gained 2.5 nats.
 LN_LOOKS = -1.5
 #: Outliers are exceptions: a look that takes more of the samples for them has another cause.
-MOST = 0.05
+OUTLIERS_MOST = 0.05
 #: Readings on no lattice that repeat the one before more often than this share are no noise with exceptions.
 REPEATS_MOST = 0.5
 #: Standard deviations of a sample beyond which a module keeps it out: of normal noise one in 5e8.
@@ -27,7 +27,7 @@ KEPT_OUT_SD = 6.0
 
 def looks(state: State, record: Record) -> list[Look]:
     """Isolated wild samples. They are exceptions: a mixture with many of them has another cause."""
-    return [look for look in mixed(state, record) if look.estimate["fraction"]["median"] <= MOST]
+    return [look for look in mixed(state, record) if look.estimate["fraction"]["median"] <= OUTLIERS_MOST]
 
 
 def mixed(state: State, record: Record) -> list[Look]:
@@ -87,8 +87,8 @@ def mixed(state: State, record: Record) -> list[Look]:
             gain,
             worth,
             {
-                "fraction": interval(fraction, math.sqrt(picked.size) / n, "1"),
-                "time_s": interval(float(record.time_s[largest]), 0.0, "s"),
+                "fraction": normal_entry(fraction, math.sqrt(picked.size) / n, "1"),
+                "time_s": normal_entry(float(record.time_s[largest]), 0.0, "s"),
             },
             {"y": y},
             when=(float(record.time_s[picked[0]]), float(record.time_s[picked[-1]])),

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.fft import next_fast_len, rfft
 
+from selfcal.base.grid import Array, Mask
 from selfcal.diagnosis import swing
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, Written
 from selfcal.diagnosis.finding import Diagnosed
@@ -17,15 +18,14 @@ from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Shape
 from selfcal.likelihood.fit import Fit
-from selfcal.likelihood.state import ALIKE, Look, Regressor, State, interval, net
-from selfcal.likelihood.statemodel import Array, Mask
+from selfcal.likelihood.state import ALIKE, FittedColumn, Look, State, net, normal_entry
 
 #: Fewer turns in a record than this are drift.
 TURNS_LEAST = 1.5
 #: A line of fewer turns is as slow as a drift: its gain must hold over all possible drifts, and its search costs more.
 SLOW_TURNS = 30.0
 #: Two axes know the frequency of one line to so many turns in the record: nearer ones share a column.
-SAME = 0.25
+SAME_TURNS = 0.25
 #: A band wider than this share of a line's frequency lies at one of its multiples by chance.
 HARMONIC_MOST = 0.1
 #: Lines whose frequencies, or multiples of them, differ by less than this share are one event.
@@ -42,7 +42,7 @@ def looks(state: State, record: Record) -> list[Look]:
 
 def _band(state: State) -> list[Look]:
     """A fast swing that noise drives (swing.py). Slow ones are the bias's own (oscillation.py)."""
-    found = swing.found(state, slow=False) if len(state.extras.bands) < swing.MOST else None
+    found = swing.found(state, slow=False) if len(state.extras.bands) < swing.SWINGS_MOST else None
     if found is None or found.keeps_phase:
         return []
     (period, damping, ln_size), fit = found.numbers, found.fit
@@ -50,12 +50,12 @@ def _band(state: State) -> list[Look]:
     sd = 1.0 / math.sqrt(max(1.0, width * fit.duration_s))
 
     def amplitude(sigma: float) -> dict[str, Any]:
-        return {"amplitude": interval(math.sqrt(2.0) * sigma * share, sigma * share * sd, state.unit)}
+        return {"amplitude": normal_entry(math.sqrt(2.0) * sigma * share, sigma * share * sd, state.unit)}
 
     estimate = {
-        "frequency_hz": interval(1.0 / period, width * sd, "Hz"),
+        "frequency_hz": normal_entry(1.0 / period, width * sd, "Hz"),
         **amplitude(fit.sigma),
-        "width_hz": interval(width, width * sd, "Hz"),
+        "width_hz": normal_entry(width, width * sd, "Hz"),
     }
     changes = {"extras": replace(state.extras, bands=(*state.extras.bands, found.numbers))}
     look = Look("periodic", found.gain, found.net, estimate, changes, shown_by="band")
@@ -116,7 +116,7 @@ def shape(state: State, record: Record, f: float, sd: float = 0.0, multiples: Se
 
     known = waves(f)
     added = tuple(
-        Regressor(f"line_{k * f:.6g}Hz{end}", "periodic", wave, "1", {"kind": "periodic", "frequency_hz": k * f})
+        FittedColumn(f"line_{k * f:.6g}Hz{end}", "periodic", wave, "1", {"kind": "periodic", "frequency_hz": k * f})
         for k in (1, *multiples)
         for end, wave in pair(k * f, record).items()
     )
@@ -129,7 +129,7 @@ def shape(state: State, record: Record, f: float, sd: float = 0.0, multiples: Se
         len(known),
         stated={"harmonics": list(multiples)} if multiples else {},
         sharper=sharper if f < half else None,
-        where=lambda fit: {"frequency_hz": interval(f, spread(fit), "Hz")},
+        where=lambda fit: {"frequency_hz": normal_entry(f, spread(fit), "Hz")},
     )
 
 
@@ -181,7 +181,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     first: list[tuple[str, float]] = []
     for name, finding in sorted(lines, key=lambda line: -line[1].look.gain):
         diagnosed, hz = found[name], _hz(finding.look)
-        common = next((f for axis, f in first if axis != name and abs(hz - f) * record.time_s[-1] < SAME), hz)
+        common = next((f for axis, f in first if axis != name and abs(hz - f) * record.time_s[-1] < SAME_TURNS), hz)
         if common == hz:
             first.append((name, hz))
             continue
@@ -250,7 +250,7 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     f, own = _hz(found[0]), _hz(look)
     known = {regressor.name for regressor in before.regressors}
 
-    def at_f(regressor: Regressor) -> Regressor:
+    def at_f(regressor: FittedColumn) -> FittedColumn:
         multiple = max(1, round(float(regressor.entry["frequency_hz"]) / own))
         return replace(regressor, values=pair(multiple * f, record).get(regressor.name[-4:], np.zeros(before.y.size)))
 
@@ -279,7 +279,7 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     return {**found, "frequency_hz": (frequency, "Hz")}
 
 
-def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+def _of_column(column: FittedColumn, c: Sequence[float]) -> dict[str, Any]:
     return {"frequency_hz": float(column.entry["frequency_hz"]), "amplitude": math.hypot(*c)}
 
 

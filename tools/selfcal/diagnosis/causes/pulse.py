@@ -13,20 +13,20 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, positive, shown
 from selfcal.diagnosis.causes import step
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.columns import SMALLER
-from selfcal.likelihood.edges import EDGE, SHORTEST, Scan, edge, raised, scan
+from selfcal.likelihood.edges import EDGE, EDGES_APART, Scan, edge, raised, scan
 from selfcal.likelihood.fit import Fit, moved, run
 from selfcal.likelihood.state import Look, State
-from selfcal.likelihood.statemodel import Array
 
 #: Places of a step among which pairs are looked for, of blocks.
-PLACES = 96
+PAIR_PLACES = 96
 #: Pairs that are tried, and how far they are apart, places.
-TRIED, APART = 2, 3
+TRIED, PAIRS_APART = 2, 3
 #: Two steps that gain so much more with sizes of their own, nats and share of the gain, are no pulse. Of pulses 2 in
 #: 1000 do by chance; the share is that of sizes a third apart.
 UNEQUAL, UNEQUAL_SHARE = 5.0, 0.03
@@ -35,11 +35,11 @@ UNEQUAL, UNEQUAL_SHARE = 5.0, 0.03
 def looks(state: State, record: Record) -> list[Look]:
     """The best pair of places, where its steps are of one size."""
     n = state.y.size
-    if n < 10 * SHORTEST:
+    if n < 10 * EDGES_APART:
         return []
     steps = scan(state.series, state.best)
     pairs = [edges.sharper(state, fit, two) for fit, two in (*_coarse(state), *_of_step(state, steps))]
-    inside = [two for two in pairs if two[0] >= EDGE and two[1] <= n - EDGE and two[1] - two[0] >= SHORTEST]
+    inside = [two for two in pairs if two[0] >= EDGE and two[1] <= n - EDGE and two[1] - two[0] >= EDGES_APART]
     found = columns.looks(state, "pulse", [edges.shape(state, "pulse", two, steps) for two in inside])
     for look in found:
         column = look.changes["regressors"][-1].values
@@ -56,7 +56,7 @@ def _coarse(state: State) -> list[tuple[Fit, tuple[int, int]]]:
     wandering lines and the colour of the noise: the means are taken without."""
     series, block = state.means()
     m = series.y.size
-    places = np.unique(np.linspace(0, m, PLACES + 2).astype(int)[1:-1])
+    places = np.unique(np.linspace(0, m, PAIR_PLACES + 2).astype(int)[1:-1])
     more = series.beside((np.arange(m)[None, :] >= places[:, None]).astype(np.float64))
     drifts = [(fit, less) for fit in state.fits if fit.terms in state.near() for less in (0.0, *SMALLER)]
     values = []
@@ -77,7 +77,7 @@ def _coarse(state: State) -> list[tuple[Fit, tuple[int, int]]]:
         i, j = divmod(int(value.argmax()), places.size)
         fit, less = drifts[int(np.argmax([table[i, j] for table in values]))]
         found.append((fit.shrunk(less), (int(places[i]) * block, int(places[j]) * block)))
-        value[max(0, i - APART) : i + APART + 1, max(0, j - APART) : j + APART + 1] = -math.inf
+        value[max(0, i - PAIRS_APART) : i + PAIRS_APART + 1, max(0, j - PAIRS_APART) : j + PAIRS_APART + 1] = -math.inf
     return found
 
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from selfcal._reference import Random
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, medians, positive, shown
-from selfcal.likelihood.statemodel import Array
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from selfcal.base import units
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Simulated, Written, positive, shown
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit
-from selfcal.likelihood.state import NET_LEAST, Look, State, interval, net
-from selfcal.likelihood.statemodel import Array, Terms
+from selfcal.likelihood.state import NET_LEAST, Look, State, net, normal_entry
+from selfcal.likelihood.statemodel import Terms
 from selfcal.model.laws import RATIO_LIMITS
 
 #: The prior of the spectral ratio reaches so many times either way about the recording's, and never above 1.
@@ -49,8 +50,8 @@ def _sizes(unit: str, fit: Fit) -> dict[str, Any]:
     N, of_N = size * (1.0 + m) * math.sqrt(fit.dt), math.sqrt((0.5 + (1.0 - m) / (1.0 + m)) / n)
     Q, of_Q = size * math.sqrt(-m) * fit.dt, math.sqrt((0.5 + (1.0 - m * m) / max(4.0 * m * m, 1e-12)) / n)
     return {
-        "Q": interval(Q, Q * of_Q, units.times_second(unit)),
-        "N": interval(N, N * of_N, f"{unit}/sqrt(Hz)"),
+        "Q": normal_entry(Q, Q * of_Q, units.times_second(unit)),
+        "N": normal_entry(N, N * of_N, f"{unit}/sqrt(Hz)"),
     }
 
 

@@ -8,7 +8,7 @@ from selfcal.diagnosis.cause import Cause, Grouping, Key, Simulated, Written, sh
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Shape
-from selfcal.likelihood.state import Look, Regressor, State
+from selfcal.likelihood.state import FittedColumn, Look, State
 from selfcal.model.regressors import coefficient_unit
 
 
@@ -26,7 +26,7 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
 def _shape(state: State, record: Record) -> Shape:
     t = record.time_s
     middle = float(0.5 * t[-1])
-    column = Regressor("time", "ramp", t - middle, "s", {"kind": "time", "reference": middle})
+    column = FittedColumn("time", "ramp", t - middle, "s", {"kind": "time", "reference": middle})
     keys = (("slope", coefficient_unit(state.unit, column.unit)),)
     return Shape("ramp", column.values[None], (column,), keys, price=LN_SLOW)
 

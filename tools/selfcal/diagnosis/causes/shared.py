@@ -18,22 +18,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
 
+from selfcal.base.grid import Array, Rows
 from selfcal.diagnosis.cause import Cause, Grouping, Scored, shown
-from selfcal.diagnosis.causes.cross_axis import leaks, without
+from selfcal.diagnosis.causes.cross_axis import leaks, without_axis
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.columns import LN_EITHER
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, interval, net
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, net, normal_entry
 
 #: Bands are thirds of an octave, of so many bins of the spectrum at least.
-PARTS, BINS_LEAST = 3, 16
+OCTAVE_PARTS, BINS_LEAST = 3, 16
 #: An innovation counts as so many standard deviations at most: an event on both axes is no noise.
 CLIP = 4.0
 #: Bins so far above the largest of noise, in units of their band's power, hold a line. Neighbours are left out too.
 LINE_LEAST, LINE_HALF = 4.0, 2
 #: Pieces of the record at most, over which the correlation must be steady.
-PIECES = 64
+STEADY_PIECES_MOST = 64
 #: A band of noise has half a width of this share of its frequency at least, and of so many bins of the spectrum. A
 #: narrower one is a disturbance of that frequency.
 BROAD, BROAD_BINS = 0.02, 4.0
@@ -84,11 +84,11 @@ class Pair:
         return np.sqrt(np.maximum(total, 1e-300) / np.maximum(count, 1.0))
 
     @cached_property
-    def edges(self) -> NDArray[np.int64]:
+    def edges(self) -> Rows:
         """First bins of the bands, from the slowest to the fastest, and the end of the last."""
         edges = [self.u.size // 2 + 1]
         while edges[-1] > BINS_LEAST:
-            low = min(int(edges[-1] / 2.0 ** (1.0 / PARTS)), edges[-1] - BINS_LEAST)
+            low = min(int(edges[-1] / 2.0 ** (1.0 / OCTAVE_PARTS)), edges[-1] - BINS_LEAST)
             edges.append(low if low > BINS_LEAST else 1)
         return np.array(edges[::-1], np.int64)
 
@@ -178,7 +178,7 @@ def _steadiness(pair: Pair, found: Common) -> float:
     inside[first:end] = True
     turn = found.coherence / max(abs(found.coherence), 1e-300)
     u, v = (irfft(np.where(inside, spectrum, 0.0), pair.u.size) for spectrum in (U, V * turn))
-    count = min(PIECES, int(found.bins))
+    count = min(STEADY_PIECES_MOST, int(found.bins))
     parts = np.array([float(part.sum()) for part in np.array_split(u * v, count)])
     scatter = max(float(parts.std(ddof=1)) * math.sqrt(count), 1e-300)
     return 0.5 * (float(parts.sum()) / scatter) ** 2
@@ -189,13 +189,13 @@ def look(pair: Pair, found: Common, other: str) -> Look:
     size = found.correlation
     sd = (1.0 - size**2) / math.sqrt(max(2.0 * found.bins, 1.0))
     share, share_sd = abs(size), sd
-    estimate: dict[str, Any] = {"other": other, "correlation": interval(size, sd, "1")}
+    estimate: dict[str, Any] = {"other": other, "correlation": normal_entry(size, sd, "1")}
     if found.band is not None:
         U, V = (np.abs(spectrum) ** 2 for spectrum in pair.raw)
         first, end = found.band
         inside = math.sqrt(float(U[first:end].sum() / U.sum()) * float(V[first:end].sum() / V.sum()))
         share, share_sd = share * inside, share_sd * inside
-    estimate["share"] = interval(share, share_sd, "1")
+    estimate["share"] = normal_entry(share, share_sd, "1")
     if found.band is not None:
         hz = 1.0 / (pair.u.size * pair.dt)
         low = 0.0 if found.band[0] == 1 else found.band[0] * hz
@@ -305,7 +305,7 @@ def _leaks(
         other = str(finding.look.estimate["other"])
         if other not in states:
             continue
-        free = without(axis.state, other)
+        free = without_axis(axis.state, other)
         source = record.calm(other, states[other].whitened)
         both = common(pair_of(free.whitened, source, free.dt), ln_pairs)
         if both is None or both.net < NET_LEAST:

@@ -11,7 +11,7 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.edges import KEYS, scan
-from selfcal.likelihood.state import SCREEN, Look, Regressor, State
+from selfcal.likelihood.state import SCREEN, FittedColumn, Look, State
 
 #: Jumps of two axes so close to each other, s, are one event.
 ONE_EVENT_S = 30.0
@@ -68,7 +68,7 @@ def entry(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[s
     return {**entry, "name": edges.name(entry["kind"], times), **dict(zip(keys, times, strict=True))}
 
 
-def of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+def of_column(column: FittedColumn, c: Sequence[float]) -> dict[str, Any]:
     """Keys of `simulate --effect`."""
     times = [float(column.entry[key]) for of in KEYS.values() for key in of if key in column.entry]
     duration = {"duration_s": times[1] - times[0]} if len(times) > 1 else {}

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from selfcal._reference import Random
-from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, counted
-from selfcal.likelihood.statemodel import Array
+from selfcal.base.grid import Array
+from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, count_key
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:
@@ -26,7 +26,7 @@ CAUSE = Cause(
     grouping=Grouping(alike=lambda a, b: bool(a.estimate["intervals"][0][0] == b.estimate["intervals"][0][0])),
     score=Scored(no_gain="readings that stick are no readings: none is scored"),
     simulated=Simulated(
-        keys={"intervals": counted(lambda s: 2)},
+        keys={"intervals": count_key(lambda s: 2)},
         of_estimate=lambda look: {"intervals": len(look.estimate["intervals"])},
         spoil=_spoil,
     ),

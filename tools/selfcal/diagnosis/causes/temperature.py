@@ -1,7 +1,7 @@
 """The bias follows the temperature, in any of its forms."""
 
 from selfcal.diagnosis.cause import Key
-from selfcal.diagnosis.forms import side_cause
+from selfcal.diagnosis.channel_looks import side_cause
 
 CAUSE = side_cause(
     "temperature",

@@ -14,20 +14,20 @@ import numpy as np
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, shown
 from selfcal.diagnosis.causes import step
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.state import NET_LEAST, Look, State, interval
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import NET_LEAST, Look, State, normal_entry
 
 #: Share by which the specific force at rest may differ from standard gravity.
-NEAR = 0.1
+GRAVITY_SHARE_MOST = 0.1
 #: Share of the step's information that two angles explain, at least.
-EXPLAINED = 0.9
+EXPLAINED_LEAST = 0.9
 #: Time about the event over which the gyroscopes' rates are summed up, s, and standard deviations beyond which their
 #: angle tells the sense of the turn.
-ABOUT_S, SURE = 3.0, 3.0
+ABOUT_S, SENSE_SDS = 3.0, 3.0
 
 
 def settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
@@ -69,14 +69,14 @@ def _turn_of(looks: Mapping[str, Look], states: Mapping[str, State]) -> tuple[di
     # A turn keeps the length of f. What lies along f beyond that is none.
     across = size - f * float(f @ size + 0.5 * size @ size) / float(f @ f)
     along = (size - across) ** 2
-    if float(information @ along) > (1.0 - EXPLAINED) * float(information @ size**2):
+    if float(information @ along) > (1.0 - EXPLAINED_LEAST) * float(information @ size**2):
         return None
     if float(information.max() * along[information == 0.0].sum()) > 2.0 * NET_LEAST:  # another axis would show it
         return None
     turn = -np.cross(f, size) / float(f @ f)
     time_s = next(iter(looks.values())).estimate["time_s"]["median"]
     turned = _turned(states, [f"g{name[-1]}" for name in axes], time_s)
-    sure = turned is not None and bool(np.abs(turned[0] / turned[1]).max() > SURE)
+    sure = turned is not None and bool(np.abs(turned[0] / turned[1]).max() > SENSE_SDS)
     if turned is not None and sure and float(turned[0] @ turn) < 0.0:
         return None
     weight = np.where(information > 0.0, 1.0 / np.maximum(information, 1e-300), 0.0)
@@ -84,7 +84,7 @@ def _turn_of(looks: Mapping[str, Look], states: Mapping[str, State]) -> tuple[di
     for k in np.argsort(np.abs(f))[:2]:
         row = -np.cross(f, np.eye(3))[:, k] / float(f @ f)
         sd = math.sqrt(float(row**2 @ weight))
-        angles[f"angle_{axes[k][-1]}_deg"] = interval(math.degrees(turn[k]), math.degrees(sd), "deg")
+        angles[f"angle_{axes[k][-1]}_deg"] = normal_entry(math.degrees(turn[k]), math.degrees(sd), "deg")
     return angles, sure
 
 
@@ -98,7 +98,7 @@ def _specific_force(states: Mapping[str, State]) -> dict[str, tuple[float, float
             continue
         found[name] = ((state.level + float(state.best.c[0])) * factor, factor)
     size = math.sqrt(sum(level**2 for level, _ in found.values()))
-    return found if len(found) == 3 and abs(size / units.STANDARD_GRAVITY - 1.0) < NEAR else None
+    return found if len(found) == 3 and abs(size / units.STANDARD_GRAVITY - 1.0) < GRAVITY_SHARE_MOST else None
 
 
 def _turned(states: Mapping[str, State], names: list[str], time_s: float) -> tuple[Array, Array] | None:

@@ -10,18 +10,18 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, medians, positive, shown
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Number, Shape
-from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, log_normal
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import NET_LEAST, FittedColumn, Look, State, log_normal
 
 #: The fastest time constant looked for, samples.
 FASTEST = 5.0
 #: Two time constants of one transient lie this factor apart at least.
-APART = 4.0
+TAUS_APART = 4.0
 #: Price of the search over a time constant beside its degree of freedom.
 LN_LOOKS = 0.4
 
@@ -29,7 +29,7 @@ LN_LOOKS = 0.4
 def looks(state: State, record: Record) -> list[Look]:
     """The best time constant, or the best two where a single one shows settling and both are clearly more likely."""
     tau = _grid(record)
-    pairs = (_shape(state, record, two) for two in combinations(tau, 2) if two[1] > 0.999 * APART * two[0])
+    pairs = (_shape(state, record, two) for two in combinations(tau, 2) if two[1] > 0.999 * TAUS_APART * two[0])
     return columns.looks(state, "turn_on", [_shape(state, record, [constant]) for constant in tau], pairs)
 
 
@@ -50,13 +50,13 @@ def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
     low, high = _range(record)
     numbers = [Number(f"tau{ends[-1]}_s", float(tau[-1]), "s", low, high)]
     if len(tau) == 2:
-        fastest = min(low / float(tau[1]), 1.0 / APART)
-        numbers.append(Number("tau_s", float(tau[0] / tau[1]), "s", fastest, 1.0 / APART, of="tau_2_s"))
+        fastest = min(low / float(tau[1]), 1.0 / TAUS_APART)
+        numbers.append(Number("tau_s", float(tau[0] / tau[1]), "s", fastest, 1.0 / TAUS_APART, of="tau_2_s"))
     return Shape(
         f"{len(tau)}",
         rows,
         tuple(
-            Regressor(
+            FittedColumn(
                 f"turn_on_{constant:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "tau_s": digits(float(constant))}
             )
             for constant, row in zip(tau, rows, strict=True)

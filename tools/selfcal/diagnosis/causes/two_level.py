@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
+from selfcal.base.grid import Array, Mask
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.columns import LN_SLOW, SMALLER, top
 from selfcal.likelihood.edges import scan, steady
 from selfcal.likelihood.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
-from selfcal.likelihood.statemodel import Array, Mask
 
 #: Tried first: amplitudes over the white noise of a block, dwell times in blocks.
 AMPLITUDES = (0.5, 0.75, 1.1, 1.6, 2.4, 3.6)
@@ -35,7 +35,7 @@ JUMPS_LEAST = 4
 #: Price of the search beside three degrees of freedom.
 LN_LOOKS = 2.0 + LN_SLOW
 #: Limits of a probability, and the largest exponent, of a double.
-LEAST, LN_MOST = float(np.finfo(float).eps), math.log(np.finfo(float).max)
+PROBABILITY_LEAST, LN_MOST = float(np.finfo(float).eps), math.log(np.finfo(float).max)
 
 
 def switching(y: Array, theta: Array) -> tuple[Array, Array]:
@@ -60,7 +60,7 @@ def switching(y: Array, theta: Array) -> tuple[Array, Array]:
             ratio = np.exp(np.minimum(A * e / S, LN_MOST))
             upper = w * ratio
             both = odds[k] = upper - w + 1.0
-            w = np.minimum(np.maximum(upper / both, LEAST), 1.0 - LEAST)
+            w = np.minimum(np.maximum(upper / both, PROBABILITY_LEAST), 1.0 - PROBABILITY_LEAST)
             e = e + half
             x = x + gain * (e - A * w)
             P = P - gain * P + (gain * A) ** 2 * (w - w * w)
@@ -144,7 +144,7 @@ def _shaken(state: State, record: Record, levels: Array) -> bool:
         if not level > 0.0:
             continue
         # Neighbouring differences have a sample in common: their squares count half.
-        gain = 0.5 * variance_change.slope_of(np.minimum(variance / level, variance_change.MOST) + 1e-12, levels)[1]
+        gain = 0.5 * variance_change.slope_of(np.minimum(variance / level, variance_change.CLIP_AT) + 1e-12, levels)[1]
         if net(gain, 1, math.log(len(variances))) >= NET_LEAST:
             louder.add(name)
     if not louder:
@@ -157,7 +157,7 @@ def _shaken(state: State, record: Record, levels: Array) -> bool:
 def _without(ln_rho: float, ln_sigma: float) -> Array:
     """Walks beside one level [g, 5], for the same filter."""
     walks, whites = (axis.ravel() for axis in np.meshgrid(WALKS, WHITES))
-    none, dwell = np.full(walks.size, math.log(LEAST) + ln_sigma), np.full(walks.size, math.log(100.0))
+    none, dwell = np.full(walks.size, math.log(PROBABILITY_LEAST) + ln_sigma), np.full(walks.size, math.log(100.0))
     return np.column_stack([none, dwell, dwell, ln_rho + walks, ln_sigma + whites])
 
 
@@ -169,7 +169,7 @@ def _law(state: State) -> float:
 
 def _best(y: Array, middle: Array) -> tuple[Array, float]:
     """The likeliest parameters from `middle` on, and their ln likelihood."""
-    unbounded = np.tile([LEAST, 1.0 / LEAST], (middle.size, 1))
+    unbounded = np.tile([PROBABILITY_LEAST, 1.0 / PROBABILITY_LEAST], (middle.size, 1))
     theta = np.log(top(lambda some: switching(y, np.log(some))[0], np.exp(middle).tolist(), unbounded))
     return theta, float(switching(y, theta[None])[0][0])
 
@@ -188,10 +188,7 @@ def _jumps(upper: Mask) -> int:
 def _stays(upper: Mask) -> list[tuple[float, float]]:
     """Blocks at the lower and at the upper level, and jumps away from each."""
     change = np.diff(upper.astype(int))
-    return [
-        (float((~upper).sum()), float((change > 0).sum())),
-        (float(upper.sum()), float((change < 0).sum())),
-    ]
+    return [(float((~upper).sum()), float((change > 0).sum())), (float(upper.sum()), float((change < 0).sum()))]
 
 
 def _dwell(time: float, count: float, dt: float) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from selfcal.base.grid import Rows
+from selfcal.base.grid import Array, Rows
 from selfcal.diagnosis.cause import (
     Cause,
     Extension,
@@ -31,30 +31,29 @@ from selfcal.diagnosis.cause import (
 )
 from selfcal.diagnosis.causes import vibration
 from selfcal.diagnosis.causes.step import ONE_EVENT_S
-from selfcal.diagnosis.forms import SMOOTHING_S
+from selfcal.diagnosis.channel_looks import SMOOTHING_S
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood.columns import LN_EITHER, LN_SLOW, NEARLY
 from selfcal.likelihood.edges import WEIGHT_LEAST, raised
 from selfcal.likelihood.fit import run
-from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, ln_looks, mixture, net, normal_entry
 from selfcal.logs.recording import SIDE_CHANNELS
-from selfcal.readings.motion import LEVEL
+from selfcal.readings.moves import LEVEL
 
 #: A change of the noise keeps this many samples, and this share of the record, from either end.
 EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0
 #: ln of the variance over that of the rest, at most: readings that are so much quieter have no noise, they repeat.
 LOUDEST = math.log(1e3)
 #: Places among which the two ends of a stretch are looked for first.
-PLACES = 120
+END_PLACES = 120
 #: A squared innovation counts as so many variances at most: one wild sample is no change of the noise.
-MOST = 12.0
+CLIP_AT = 12.0
 #: Steps of the search for a slope, and the largest one in standard deviations of the channel.
-STEPS, FARTHEST = 30, 1.0
+SLOPE_STEPS, SLOPE_MOST = 30, 1.0
 #: Samples that the level of another axis leaves out: the one that is judged, and two on either side. Where one axis is
 #: in the other, at once or a sample late, or both share noise, a square of one is in the variance of the other.
-OWN = 5
+OWN_SAMPLES = 5
 #: Shares of the record that the channel lies below at the quiet and at the loud end of `ratio`.
 ENDS = (0.05, 0.95)
 
@@ -75,7 +74,7 @@ class Power:
         there = np.isfinite(whitened)
         known, near = (uniform_filter1d(rows, LEVEL, axis=1) for rows in (there.astype(float), np.nan_to_num(whitened)))
         apart = (whitened - near / np.maximum(known, 1e-9)) / np.sqrt(1.0 - 1.0 / LEVEL)
-        square = np.where(there, np.minimum(apart**2, MOST) + 1e-12, 0.0)
+        square = np.where(there, np.minimum(apart**2, CLIP_AT) + 1e-12, 0.0)
         total, count = (np.cumsum(np.pad(rows, ((0, 0), (1, 0))), axis=1) for rows in (square, there.astype(float)))
         return cls(total, count, np.flatnonzero(there.any(axis=0)))
 
@@ -116,7 +115,7 @@ class Power:
         """The likeliest change that lasts, and the likeliest stretch, by all axes together: from and before which
         sample."""
         places = self.present[1:]
-        coarse = places[np.unique(np.linspace(0, places.size - 1, PLACES).astype(int))]
+        coarse = places[np.unique(np.linspace(0, places.size - 1, END_PLACES).astype(int))]
         first, last = coarse[np.transpose(np.triu_indices(coarse.size, 1))].T
         at = int(np.argmax(self.gain(first, last).sum(axis=0)))
         return [self.moved(int(places[0]), self.n), self.moved(int(first[at]), int(last[at]))]
@@ -158,8 +157,8 @@ def looks(state: State, record: Record) -> list[Look]:
     present = np.isfinite(state.whitened)
     if present.sum() < 4 * EDGE_SAMPLES:
         return []
-    square = np.minimum(state.whitened[present] ** 2, MOST) + 1e-12
-    times = [_of_time(state, record, *ends) for _, ends in stretches([state])]
+    square = np.minimum(state.whitened[present] ** 2, CLIP_AT) + 1e-12
+    times = [_of_time(state, record, *ends) for _, ends in noisy_stretches([state])]
     best: dict[str, tuple[float, Level]] = {}
     for level in (*times, *levels(state, record)):
         gain = slope_of(square, level.values[present])[1]
@@ -189,7 +188,7 @@ def filtered(states: Sequence[State], power: Power, begin: int, end: int) -> Pow
     return Power.of(np.array(rows))
 
 
-def stretches(states: Sequence[State]) -> Iterator[tuple[Power, tuple[int, int]]]:
+def noisy_stretches(states: Sequence[State]) -> Iterator[tuple[Power, tuple[int, int]]]:
     """The likeliest change that lasts, and the likeliest stretch: the power of the axes beside it, and its ends."""
     first = Power.of(np.array([state.whitened for state in states]))
     for ends in first.best():
@@ -202,7 +201,7 @@ def _look(state: State, level: Level) -> Look:
     present = np.isfinite(state.whitened)
     changed, slope, sd = state, 0.0, math.inf
     for _ in range(2):
-        square = np.minimum(changed.whitened[present] ** 2, MOST) + 1e-12
+        square = np.minimum(changed.whitened[present] ** 2, CLIP_AT) + 1e-12
         more, _, sd = slope_of(square, level.values[present])
         slope += more
         changed = state.refit(r=state.r * np.exp(slope * level.values))
@@ -242,7 +241,7 @@ def _of_time(state: State, record: Record, begin: int, end: int) -> Level:
         if end < n:
             until = time(present, *likely(power.gain(begin, after)[0], after, wide))
             lasts, sds = until["median"] - found["time_s"]["median"], (until["sd"], found["time_s"]["sd"])
-            found["duration_s"] = interval(lasts, math.hypot(*sds), "s")
+            found["duration_s"] = normal_entry(lasts, math.hypot(*sds), "s")
         sds = ratios * np.sqrt(0.5 * wide * (1.0 / np.maximum(many, 1.0)).sum(axis=0)[0])
         return {**found, "ratio": mixture(weight, ratios, sds, "1")}
 
@@ -269,8 +268,8 @@ def levels(state: State, record: Record) -> Iterator[Level]:
                 "channel": name,
                 "input": by,
                 "form": "static",
-                "coefficient": interval(size, sd, "1" if unit == "1" else f"1/{unit}"),
-                "ratio": interval(ratio, ratio * span * sd, "1"),
+                "coefficient": normal_entry(size, sd, "1" if unit == "1" else f"1/{unit}"),
+                "ratio": normal_entry(ratio, ratio * span * sd, "1"),
             }
 
         return Level(name, values - values.mean(), lambda gain: price, told)
@@ -281,11 +280,11 @@ def levels(state: State, record: Record) -> Iterator[Level]:
                 yield level(name, unit, smoothed(values, round(width / dt)), "value")
     for name, values in others.items():
         for width in vibration.WIDTHS_S:
-            if width * record.recorded_hz >= vibration.LEAST and width <= 0.1 * n * dt:
+            if width * record.recorded_hz >= vibration.ENOUGH and width <= 0.1 * n * dt:
                 cells = round(width / dt)
                 power = smoothed(values, cells)
-                if cells > OWN:
-                    power = (cells * power - OWN * smoothed(values, OWN)) / (cells - OWN)
+                if cells > OWN_SAMPLES:
+                    power = (cells * power - OWN_SAMPLES * smoothed(values, OWN_SAMPLES)) / (cells - OWN_SAMPLES)
                 yield level(name, "1", np.log(np.maximum(power / power.max(), 1e-12)), "variance")
 
 
@@ -304,12 +303,12 @@ def slope_of(square: Array, values: Array) -> tuple[float, float, float]:
 
     none = now = value(0.0)
     bend = 1.0
-    for _ in range(STEPS):
+    for _ in range(SLOPE_STEPS):
         share = square * np.exp(-b * x)
         share /= share.sum()
         mean = float(share @ x)
         bend = 0.5 * n * max(float(share @ x**2) - mean**2, 1e-9)
-        step = float(np.clip(0.5 * n * mean / bend, -FARTHEST, FARTHEST))
+        step = float(np.clip(0.5 * n * mean / bend, -SLOPE_MOST, SLOPE_MOST))
         while (there := value(b + step)) < now and abs(step) > 1e-6:
             step *= 0.5
         b, now = b + step, max(there, now)
@@ -320,7 +319,7 @@ def slope_of(square: Array, values: Array) -> tuple[float, float, float]:
 
 def _trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
     """The change of the noise as the training samples have it."""
-    square = np.minimum(before.whitened[:split] ** 2, MOST)
+    square = np.minimum(before.whitened[:split] ** 2, CLIP_AT)
     shape, there = np.log(after.r / before.r), np.isfinite(square)
     return replace(after, r=before.r * np.exp(slope_of(square[there], shape[:split][there])[0] * shape))
 

@@ -8,27 +8,27 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis import forms
+from selfcal.base.grid import Array
+from selfcal.diagnosis import channel_looks
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Simulated, Written, shown
-from selfcal.diagnosis.forms import Channel
+from selfcal.diagnosis.channel_looks import Channel
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood.columns import LN_SLOW
 from selfcal.likelihood.state import Look, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.model.forms import variance_of
 
 #: Widths of the means of a variance, s.
 WIDTHS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 #: Differences that a variance is taken from at least: one alone scatters by 1.7 times itself.
-LEAST = 8
+ENOUGH = 8
 
 
 def looks(state: State, record: Record) -> list[Look]:
     """One look for every other axis whose variance is known."""
     others = {name: values for name, values in record.variances(state.axis).items() if np.ptp(values) > 0.0}
-    widths = tuple(width for width in WIDTHS_S if width * record.recorded_hz >= LEAST) or WIDTHS_S[-1:]
-    return forms.look(
+    widths = tuple(width for width in WIDTHS_S if width * record.recorded_hz >= ENOUGH) or WIDTHS_S[-1:]
+    return channel_looks.look(
         state,
         [
             Channel(
@@ -52,9 +52,9 @@ def looks(state: State, record: Record) -> list[Look]:
 def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
     """The variance of 1 s of the other axis, about its mean."""
     interval_s = float(channels.time_s[1] - channels.time_s[0])
-    variance = smoothed(bridged(variance_of(channels.axes[str(keys["other"])])), max(LEAST, round(1.0 / interval_s)))
+    variance = smoothed(bridged(variance_of(channels.axes[str(keys["other"])])), max(ENOUGH, round(1.0 / interval_s)))
     about: Array = variance - variance.mean()
-    return float(keys["coefficient"]) * about + forms.added(keys, channels, about)
+    return float(keys["coefficient"]) * about + channel_looks.added(keys, channels, about)
 
 
 CAUSE = Cause(
@@ -65,11 +65,11 @@ CAUSE = Cause(
     looks=looks,
     pictures=shown("means", "evidence"),
     grouping=Grouping(pairs=True),
-    written=Written(smoothed=True, of_column=forms.of_other),
+    written=Written(smoothed=True, of_column=channel_looks.of_other),
     simulated=Simulated(
-        keys={"coefficient": Key(lambda s: 0.3 * s.n / s.sd**2), "lag_s": forms.EFFECT_KEYS["lag_s"]},
+        keys={"coefficient": Key(lambda s: 0.3 * s.n / s.sd**2), "lag_s": channel_looks.EFFECT_KEYS["lag_s"]},
         follows=True,
-        of_estimate=forms.of_look,
+        of_estimate=channel_looks.of_look,
         add=_add,
     ),
 )

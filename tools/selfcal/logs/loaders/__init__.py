@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, TypedDict
 
-from selfcal.base.errors import UserError, install
+from selfcal.base.errors import UserError, install_line
 from selfcal.base.options import Option, Scale, option, parse_pairs
 
 #: Text, each with .gz too.
@@ -106,8 +106,7 @@ class Reading(TypedDict, total=False):
     no_time: Annotated[bool, option("Leave the time column out; takes --rate", "--no-time")]
     skip_bad: Annotated[bool, option("Skip lines of a text that are no rows, and count them", "--skip-bad")]
     sources: Annotated[
-        Sequence[str],
-        option("Sensor to read of a log that has several (repeat for more)", "--source", metavar="NAME"),
+        Sequence[str], option("Sensor to read of a log that has several (repeat for more)", "--source", metavar="NAME")
     ]
     dbc: Annotated[Path | str | None, option("Signals of a log of CAN frames", metavar="FILE.dbc")]
 
@@ -171,5 +170,5 @@ def _check_file(path: Path) -> None:
 def check_library(path: Path, form: Format) -> None:
     """Raise UserError, with the line to type, where the library of a format is not installed."""
     if form.library and importlib.util.find_spec(form.library) is None:
-        typed = install(f"selfcal[{form.extra}]" if form.extra else "selfcal")
+        typed = install_line(f"selfcal[{form.extra}]" if form.extra else "selfcal")
         raise UserError(f"{path}: is {form.name}, and {form.library} is not installed: {typed}")

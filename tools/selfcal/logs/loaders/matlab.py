@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_META_BYTES, reading
-from selfcal.logs.loaders.table import Hints, Table, bounded, content, inflated, parse_meta, room, vectors
+from selfcal.logs.loaders.table import Hints, Table, bounded, file_content, inflated, parse_meta, room, vectors
 
 #: Bytes of the header of a file of version 5 to 7, and the class of a text.
 _MAT_HEADER, _MAT_CHAR = 128, 4
@@ -30,7 +30,7 @@ _Variables = Iterator[tuple[str, "str | NDArray[Any]"]]
 
 def read(path: Path, _: Hints) -> list[Table]:
     """The vectors of a MATLAB file of version 4 to 7, and the columns of its matrices; a text `meta` is JSON."""
-    data = content(path)
+    data = file_content(path)
     order = None if 0 in data[:4] else {b"IM": "<", b"MI": ">"}.get(data[126:128])
     arrays: dict[str, NDArray[Any]] = {}
     meta = ""

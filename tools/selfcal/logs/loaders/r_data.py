@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
 from selfcal.base.limits import MOST_COLUMNS, MOST_R_OBJECTS, MOST_UNPACKED_BYTES, reading
-from selfcal.logs.loaders.table import Hints, Member, Table, add, content, inflated, room
+from selfcal.logs.loaders.table import Hints, Member, Table, add, file_content, inflated, room
 
 #: Column of an object of R's class `imu` (packages gmwm, simts, imudata), as `Gyro. X`.
 _IMU_COLUMN = re.compile(r"(?P<kind>Gyro|Accel)\. (?P<axis>[XYZ])")
@@ -27,7 +27,7 @@ def read(path: Path, _: Hints) -> list[Table]:
     Columns are called by their names, NAME:1, NAME:2, ... where a matrix has none; `Gyro. X` of an `imu` is gx.
     """
     with reading(path, "not a whole R file"):
-        packed = content(path)
+        packed = file_content(path)
         data = _r_unpacked(path, packed)
         for magic in (b"RDX2\n", b"RDX3\n"):
             data = data.removeprefix(magic)

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array, Rows
 from selfcal.logs.loaders.damage import parts_of
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
@@ -54,7 +54,7 @@ class Topic:
         if np.abs(order - np.arange(order.size)).max(initial=0) <= 64:
             stamps, values = stamps[order], values[order]
         notes: tuple[str, ...] = ()
-        columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {}
+        columns: dict[str, Array | Rows] = {}
         if stamps.any():
             columns["t[ns]"] = stamps
         else:
@@ -66,7 +66,7 @@ class Topic:
         return of_arrays(name, columns, notes=notes)
 
 
-def _axes(values: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
+def _axes(values: Array) -> Mapping[str, Array]:
     """Columns of the axes that an Imu [n, 37] has. A sensor that it has not reads 0 throughout, or has a covariance of
     -1 (REP 145)."""
     triads = {}

@@ -14,7 +14,7 @@ from selfcal.base.errors import MOST_NAMED, UserError, few, printable, short
 
 
 @dataclass(frozen=True)
-class Part:
+class Share:
     """One table's share in a source.
 
     `axes`: none for a table of temperatures. `warm`: a temperature can be had alone. `span` finds the number of
@@ -35,10 +35,10 @@ class Part:
         return (count - 1) / seconds if count > 1 and seconds > 0.0 else 0.0
 
 
-def chosen(path: object, parts: Sequence[Part], wanted: Sequence[str]) -> tuple[list[Part], list[Part], list[str]]:
+def chosen(path: object, parts: Sequence[Share], wanted: Sequence[str]) -> tuple[list[Share], list[Share], list[str]]:
     """The parts to read, those of them of which the temperature alone is read, and notes of the others. `wanted`: names
     that the user gives. Raises UserError, which lists the sources, where the user has to choose."""
-    sources: dict[str, list[Part]] = {}
+    sources: dict[str, list[Share]] = {}
     for part in parts:
         sources.setdefault(part.source, []).append(part)
     axes = {source: frozenset().union(*(part.axes for part in of)) for source, of in sources.items()}
@@ -73,10 +73,7 @@ def chosen(path: object, parts: Sequence[Part], wanted: Sequence[str]) -> tuple[
 
 
 def _by_rate(
-    path: object,
-    sources: dict[str, list[Part]],
-    axes: dict[str, frozenset[str]],
-    sensors: Sequence[str],
+    path: object, sources: dict[str, list[Share]], axes: dict[str, frozenset[str]], sensors: Sequence[str]
 ) -> tuple[list[str], list[str]]:
     """The sources to read, and those left out for their lower rates. Raises UserError."""
     if all(not axes[sensor] & axes[other] for k, sensor in enumerate(sensors) for other in sensors[:k]):
@@ -107,7 +104,7 @@ def _nearest(kept: Sequence[str], sides: Sequence[str]) -> list[str]:
     return best[:1] if common(best[0]) > max(1, common(best[1])) else []
 
 
-def _listed(sources: dict[str, list[Part]], axes: dict[str, frozenset[str]], names: Sequence[str]) -> str:
+def _listed(sources: dict[str, list[Share]], axes: dict[str, frozenset[str]], names: Sequence[str]) -> str:
     """The option to type for each source, with its axes, rate and length."""
     lines = []
     for name in names:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, few, short
+from selfcal.base.grid import Array, Rows
 from selfcal.base.limits import (
     BLOCK_BYTES,
     FEWEST_ROWS,
@@ -53,7 +54,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Rows:
+class TableRows:
     """What is read of a table: raw `columns` float64[n] of the `fields`, NaN where there is no sample.
 
     `fail(row, field, what)` raises UserError for a row of the file. `started`: what was taken off the stamps, in their
@@ -62,11 +63,11 @@ class Rows:
 
     path: Path
     fields: Sequence[Field]
-    columns: list[NDArray[np.float64]]
+    columns: list[Array]
     fail: Callable[[int, int | None, str], NoReturn]
     meta: Mapping[str, Any]
     started: float = 0.0
-    places: NDArray[np.int64] | None = None
+    places: Rows | None = None
     notes: tuple[str, ...] = ()
     damaged: Damaged = SOUND
 
@@ -107,7 +108,7 @@ class Table:
         """The place that a message names after the path."""
         return self.line or (f"{self.source}: " if self.source else "")
 
-    def rows(self, path: Path, fields: Sequence[Field]) -> Rows:
+    def rows(self, path: Path, fields: Sequence[Field]) -> TableRows:
         """The columns of the fields. Raises UserError."""
         count = math.prod(self.members[fields[0].key].shape)
         for wanted in fields:
@@ -125,7 +126,7 @@ class Table:
             column = "" if number is None else f"column '{fields[number].name}': "
             raise UserError(f"{path}: {self.where}row {row + 1}: {column}{what}")
 
-        started, columns = 0.0, list[NDArray[np.float64]]()
+        started, columns = 0.0, list[Array]()
         for wanted in fields:
             array = self.members[wanted.key].read()
             if wanted.name == "t" and array.dtype.kind in "iu":
@@ -135,7 +136,7 @@ class Table:
                 steps = np.where(back, -(bits[:-1] - bits[1:]).astype(float), (bits[1:] - bits[:-1]).astype(float))
                 array = np.append(0.0, np.cumsum(steps)) if back.any() else bits - bits[0]
             columns.append(array.astype(np.float64))
-        return Rows(path, fields, columns, fail, self.meta, started)
+        return TableRows(path, fields, columns, fail, self.meta, started)
 
 
 def of_arrays(
@@ -194,7 +195,7 @@ def meta_place(path: Path) -> Path:
     return path.with_name(path.name + ".meta.json")
 
 
-def content(path: Path) -> bytes:
+def file_content(path: Path) -> bytes:
     """All of a file, in blocks: memory is taken for what is there."""
     blocks, size = [], 0
     with path.open("rb") as stream:

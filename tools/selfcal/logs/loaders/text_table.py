@@ -20,12 +20,12 @@ from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import wrap_file
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, note, short
+from selfcal.base.grid import Array, Rows
 from selfcal.base.limits import (
     BLOCK_BYTES,
     LONGEST_HEADING,
@@ -56,8 +56,7 @@ _NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 _MISSING = re.compile(r"(nan?|#?n/a|#nv|null|none|-+|\?)?", re.ASCII | re.IGNORECASE)
 #: A date with a time of day (ISO 8601), in quotes or not.
 _ISO = re.compile(
-    r"(?:\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?|\d{8}T\d{6}(?:[.,]\d+)?)(?:Z|[-+]\d\d:?\d\d)?",
-    re.ASCII,
+    r"(?:\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?|\d{8}T\d{6}(?:[.,]\d+)?)(?:Z|[-+]\d\d:?\d\d)?", re.ASCII
 )
 #: A date or a time of day in any form.
 _CLOCK = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d)\b.*", re.ASCII)
@@ -129,7 +128,7 @@ class TextReader:
         #: Lines that were left out.
         self.damaged = Damaged()
         #: With `skip_bad`, after `columns`: int64[n], the place of each row among the lines after the header.
-        self.places: NDArray[np.int64] | None = None
+        self.places: Rows | None = None
         self._origin: datetime | None = None
         #: Of a time of day: the first, the last one, and the days since, s.
         self._day = (math.nan, math.nan, 0.0)
@@ -187,16 +186,16 @@ class TextReader:
 
     def columns(
         self, names: Sequence[tuple[str, str]], optional: Sequence[bool] = (), time: int | None = None
-    ) -> list[NDArray[np.float64] | None]:
+    ) -> list[Array | None]:
         """The columns [n] of pairs (heading, name in messages), n at least 2; NaN where a cell is empty.
 
         `optional`: such a column is None if a cell of it is no number. `time`: the place of a column of dates, which
         becomes seconds since the first. Raises UserError for the first fault.
         """
         index = [self.keys.index(key) for key, _ in names]
-        parts: list[list[NDArray[np.float64]] | None] = [[] for _ in index]
+        parts: list[list[Array] | None] = [[] for _ in index]
         lines, rows, blank, batch = 0, 0, False, self._batch
-        places: list[NDArray[np.int64]] = []
+        places: list[Rows] = []
         while batch:
             batch = self._kept(batch, lines)
             if self._lines.unfinished and batch and batch[0].strip():
@@ -219,7 +218,7 @@ class TextReader:
                 table = self._scan(batch[:filled], lines, index, names, optional, time, parts)
                 wanted = [k for k in wanted if parts[k] is not None]
             for k, column in zip(wanted, table.T, strict=True):
-                cast(list[NDArray[np.float64]], parts[k]).append(np.ascontiguousarray(column))
+                cast(list[Array], parts[k]).append(np.ascontiguousarray(column))
             if self._skip_bad:
                 left_out = np.array(self._skipped[skipped:], np.int64) - lines
                 places.append(np.delete(np.arange(lines, lines + filled), left_out))
@@ -230,7 +229,7 @@ class TextReader:
             raise UserError(f"{self.path}: line {self._row - 1}: there is a header but no rows")
         check_rows(f"{self.path}: line {self._row + rows - 1}: ", rows)
         self.places = np.concatenate(places) if self._skip_bad else None
-        whole: list[NDArray[np.float64] | None] = []
+        whole: list[Array | None] = []
         while parts:  # no column stays in both forms
             part = parts.pop(0)
             whole.append(None if part is None else np.concatenate(part))
@@ -331,7 +330,7 @@ class TextReader:
             raise UserError(f"{where}a heading of more than {LONGEST_HEADING} characters")
         return heading.strip()
 
-    def _parse(self, lines: list[str], index: Sequence[int], time: int | None) -> NDArray[np.float64] | None:
+    def _parse(self, lines: list[str], index: Sequence[int], time: int | None) -> Array | None:
         """float64[lines, index] of lines, the fast way; None if it takes the slow one. `time`: a column of dates."""
         if self._lines.no_text:
             return None  # which lines have it is for the slow way
@@ -372,8 +371,8 @@ class TextReader:
         names: Sequence[tuple[str, str]],
         optional: Sequence[bool],
         time: int | None,
-        parts: list[list[NDArray[np.float64]] | None],
-    ) -> NDArray[np.float64]:
+        parts: list[list[Array] | None],
+    ) -> Array:
         """The slow exact way, or the first fault. An optional column that fails leaves `parts`."""
         rows: list[list[float]] = []
         for number, line in enumerate(lines):
@@ -405,7 +404,7 @@ class TextReader:
         table = np.array(rows, np.float64).reshape(len(rows), len(index))
         return table[:, [k for k in range(len(index)) if parts[k] is not None]]
 
-    def _optional(self, cell: str, k: int, parts: list[list[NDArray[np.float64]] | None]) -> float:
+    def _optional(self, cell: str, k: int, parts: list[list[Array] | None]) -> float:
         try:
             return self._value(cell, k)
         except _Bad:

@@ -10,17 +10,14 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, NoReturn, cast
 
-from selfcal.base.errors import UserError, printable, shown
+from selfcal.base.errors import UserError, printable, short_value
 from selfcal.base.limits import MOST_COLUMNS, MOST_META_BYTES, read_text, reading
 from selfcal.logs.loaders import TEXT, ZIP
-from selfcal.logs.loaders.table import Field, Rows, Table, meta_place, parse_meta
+from selfcal.logs.loaders.table import Field, Table, TableRows, meta_place, parse_meta
 from selfcal.logs.loaders.text_table import Opened, TextReader
 
 #: Where an app writes a sensor twice, the one to read comes first: what the part measured, before an estimate of it.
-_BETTER = (
-    ("gyroscopeuncalibrated", "gyroscope"),
-    ("accelerometeruncalibrated", "totalacceleration", "accelerometer"),
-)
+_BETTER = (("gyroscopeuncalibrated", "gyroscope"), ("accelerometeruncalibrated", "totalacceleration", "accelerometer"))
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class TextTable(Table):
     skip_bad: bool
     only: tuple[str, str] | None
 
-    def rows(self, path: Path, fields: Sequence[Field]) -> Rows:
+    def rows(self, path: Path, fields: Sequence[Field]) -> TableRows:
         path = self.text.path
         meta = dict(self.meta)
         with ExitStack() as files:
@@ -64,7 +61,7 @@ class TextTable(Table):
         columns = [column for column in read if column is not None]
         rows = columns[0].size
         if meta.get("rows", rows + reader.skipped) != rows + reader.skipped:
-            what = f"{rows} rows where {meta_place(path).name} says {shown(meta['rows'])}"
+            what = f"{rows} rows where {meta_place(path).name} says {short_value(meta['rows'])}"
             raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
         skipped = "1 line is no row and was skipped"
         if reader.skipped > 1:
@@ -81,7 +78,7 @@ class TextTable(Table):
             reader.fail(row, None if number is None else fields[number].name, what)
 
         notes = (skipped,) if reader.skipped else ()
-        return Rows(path, fields, columns, fail, meta, reader.origin_s, reader.places, notes, reader.damaged)
+        return TableRows(path, fields, columns, fail, meta, reader.origin_s, reader.places, notes, reader.damaged)
 
 
 def read(path: Path, knows: Callable[[Text], Knows], skip_bad: bool) -> list[Table]:

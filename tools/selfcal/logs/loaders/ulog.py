@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.logs.loaders.damage import Bytes, mapped, sifted
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
@@ -129,7 +130,7 @@ def _triad(letter: str, values: Sequence[NDArray[Any]]) -> Columns:
     return {f"{letter}{axis}[{unit}]": column for axis, column in zip("xyz", values, strict=True)}
 
 
-def _rate(data: Mapping[str, NDArray[Any]], name: str, k: int) -> NDArray[np.float64]:
+def _rate(data: Mapping[str, NDArray[Any]], name: str, k: int) -> Array:
     """An increment over the interval that it was summed over, us; NaN for an interval of 0."""
     interval = np.asarray(data[f"{name}_dt"], np.float64) * 1e-6
     increment = np.asarray(data[f"{name}[{k}]"], np.float64)

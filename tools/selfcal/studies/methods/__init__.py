@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
 
-from selfcal.base.errors import install
+from selfcal.base.errors import install_line
 from selfcal.studies.methods.problem import Answer, Problem, Value
 
 __all__ = ["GROUP", "RIVALS", "Answer", "Problem", "Rival", "Value"]
@@ -43,16 +43,16 @@ class Rival:
         """Why it cannot run here, with the next step; empty if it can."""
         if not self.package or importlib.util.find_spec(self.package) is not None:
             return ""
-        return f"{self.package} is not installed: {install(self.package)}"
+        return f"{self.package} is not installed: {install_line(self.package)}"
 
 
 RIVALS = {
     rival.name: rival
     for rival in (
-        Rival("library", "selfcal, the library", "library", "library"),
-        Rival("grid", "the bank on a dense grid, own", "grid", "grid"),
-        Rival("allan_slopes", "Allan deviation, slopes read", "allan", "slopes"),
-        Rival("allan_fit", "Allan deviation, weighted fit", "allan", "fit"),
+        Rival("library", "selfcal, the library", "own_bank", "library"),
+        Rival("grid", "the bank on a dense grid, own", "dense_grid", "grid"),
+        Rival("allan_slopes", "Allan deviation, slopes read", "allan_fits", "slopes"),
+        Rival("allan_fit", "Allan deviation, weighted fit", "allan_fits", "fit_weighted"),
         Rival("gmwm", "wavelet moments (GMWM)", "wavelets", "gmwm"),
         Rival("autocorrelation", "autocorrelation fit", "autocorrelation", "autocorrelation"),
         Rival("whittle", "spectrum (Whittle) fit", "whittle", "whittle"),

@@ -7,13 +7,14 @@ import math
 import numpy as np
 from scipy import fft, optimize
 
-from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, root
+from selfcal.base.grid import Array
+from selfcal.studies.methods.problem import Answer, Problem, Value, root
 
 #: Lags of the fit, as a part of the record: beyond it the estimate is noise.
-PART = 0.1
+LAGS_SHARE = 0.1
 
 
-def covariances(y: Floats, u: Floats, lags: int) -> Floats:
+def covariances(y: Array, u: Array, lags: int) -> Array:
     """Of y[k] and u[k - lag], biased estimates [lags] about the means, from lag 0 on."""
     size = fft.next_fast_len(2 * y.size, real=True)
     product = fft.rfft(y - y.mean(), size) * np.conj(fft.rfft(u - u.mean(), size))
@@ -31,10 +32,10 @@ def autocorrelation(problem: Problem) -> Answer:
         white, walk = -step[1], step[0] + 2.0 * step[1]
         by_law["random_walk"] = {"N": root(white * dt), "K": root(walk / dt)}
     if "gauss_markov" in problem.laws:
-        c = covariances(problem.y, problem.y, max(4, round(PART * problem.y.size)))
+        c = covariances(problem.y, problem.y, max(4, round(LAGS_SHARE * problem.y.size)))
         lag = np.arange(1, c.size) * dt
 
-        def distance(theta: Floats) -> Floats:
+        def distance(theta: Array) -> Array:
             return np.asarray(theta[0] * np.exp(-math.exp(theta[1]) * lag) - c[1:])
 
         start = [max(float(c[1]), 1e-3 * float(c[0])), -math.log(float(lag[-1]) / 3.0)]

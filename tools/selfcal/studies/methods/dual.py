@@ -13,12 +13,13 @@ import math
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import LEVEL_SD, Answer, Floats, Problem, Value, ln_moments, logarithmic
+from selfcal.studies.methods.problem import FIRST_LEVEL_SD, Answer, Problem, Value, ln_moments, logarithmic
 from selfcal.studies.methods.recursive import FORGET, KEEP
 
 #: The parameters stay within this many sd of the prior's mean: a poor first step leads no further.
-REACH = 3.0
+MEAN_REACH = 3.0
 ROW = np.ones(2)
 
 
@@ -33,7 +34,7 @@ def _run(problem: Problem, law: str) -> dict[str, Value]:
     middle, sd = np.array([ln_moments(problem.group.priors[name]) for name in names]).T
     ln, covariance = middle.copy(), np.diag(sd**2)
     d = ln.size
-    x, P = np.zeros(2), np.diag([(LEVEL_SD * float(y.std())) ** 2, 0.0])
+    x, P = np.zeros(2), np.diag([(FIRST_LEVEL_SD * float(y.std())) ** 2, 0.0])
     dx, dP = np.zeros((d, 2)), np.zeros((d, 2, 2))
     if law == "gauss_markov":
         P[1, 1] = math.exp(2.0 * ln[1])
@@ -55,7 +56,7 @@ def _run(problem: Problem, law: str) -> dict[str, Value]:
         # With the variance of that ln chi^2.
         total = seen @ covariance @ seen.T + np.diag([S, (0.5 * math.pi**2)])
         gain = np.linalg.solve(total, seen @ covariance).T
-        ln = np.clip(ln + gain @ surprise, middle - REACH * sd, middle + REACH * sd)
+        ln = np.clip(ln + gain @ surprise, middle - MEAN_REACH * sd, middle + MEAN_REACH * sd)
         covariance = covariance - gain @ total @ gain.T
         K = PH / S
         dK = dPH / S - np.outer(dS, PH) / S**2
@@ -64,7 +65,7 @@ def _run(problem: Problem, law: str) -> dict[str, Value]:
     return logarithmic(names, ln, covariance)
 
 
-def transition(law: str, ln: Floats, dt: float) -> tuple[Floats, Floats, Floats, Floats, float, Floats]:
+def transition(law: str, ln: Array, dt: float) -> tuple[Array, Array, Array, Array, float, Array]:
     """F (diagonal, so its own transpose), Q and R of level and drift, each followed by its derivatives in ln theta."""
     d = ln.size
     F, dF, Q, dQ, dR = np.eye(2), np.zeros((d, 2, 2)), np.zeros((2, 2)), np.zeros((d, 2, 2)), np.zeros(d)

@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
+from selfcal.base.grid import Array, Mask
 from selfcal.batch.spread import Row
 from selfcal.model.file import Group, Model, Prior
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods import Rival
-from selfcal.studies.methods.problem import Answer, Floats, Problem
+from selfcal.studies.methods.problem import Answer, Problem
 
 #: The method that errors are compared with.
 REFERENCE = "ml"
@@ -36,7 +36,7 @@ class Cell:
 def rows_of(model: Model, axis: str, truth_from: str, chosen: Sequence[Rival], cell: Cell) -> list[Row]:
     """A row for each method. The estimates are those of the true law, the weights those of all laws."""
     group = model.group_of(axis)
-    truth = draw(group, cell.law, np.random.default_rng([cell.seed, list(NAMED).index(cell.law)]))
+    truth = draw_parameters(group, cell.law, np.random.default_rng([cell.seed, list(NAMED).index(cell.law)]))
     if truth_from == "middle":
         truth |= {name: group.priors[name].median for name in NAMED[cell.law].parameters}
     y, _ = simulate_bank_samples(cell.law, truth, model.bank_rate_hz, cell.samples, cell.seed)
@@ -63,7 +63,7 @@ def rows_of(model: Model, axis: str, truth_from: str, chosen: Sequence[Rival], c
     return rows
 
 
-def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
+def ensemble_summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
     """An entry for each number of samples, law and method.
 
     Of each parameter: the rms error of its logarithm, over the reference's with a 95 % interval; the share of the 90 %
@@ -96,7 +96,7 @@ def _criteria(rows: Sequence[Row]) -> list[str]:
     return sorted({key.split(".")[1] for key in stated if key.startswith("weight.")})
 
 
-def _column(rows: Sequence[Row], key: str) -> Floats:
+def _column(rows: Sequence[Row], key: str) -> Array:
     return np.array([math.nan if row.get(key) is None else row[key] for row in rows], dtype=float)
 
 
@@ -126,15 +126,15 @@ def _errors(mine: Sequence[Row], reference: Sequence[Row] | None, name: str, pri
     return entry
 
 
-def _ln_clipped(value: Floats, prior: Prior) -> Floats:
+def _ln_clipped(value: Array, prior: Prior) -> Array:
     return np.log(np.clip(value, prior.min, prior.max))
 
 
-def _rms(error: Floats) -> float:
+def _rms(error: Array) -> float:
     return math.sqrt(float((error**2).mean())) if error.size else math.nan
 
 
-def _ratio(ours: Floats, theirs: Floats) -> tuple[float, float, float]:
+def _ratio(ours: Array, theirs: Array) -> tuple[float, float, float]:
     """Ratio of two rms errors of the same records, with 2.5 % and 97.5 % of a bootstrap that resamples the records."""
     if not ours.size or not theirs.any():
         return math.nan, math.nan, math.nan
@@ -150,7 +150,7 @@ def _choice(rows: Sequence[Row], criterion: str, law: str) -> dict[str, float]:
     weight = np.array([_column(rows, f"weight.{criterion}.{weighed}") for weighed in laws])
     true = weight[laws.index(law)]
     score = np.log(np.maximum(np.nan_to_num(true), LEAST_WEIGHT))
-    hit: NDArray[np.bool_] = true >= np.nan_to_num(weight).max(axis=0)
+    hit: Mask = true >= np.nan_to_num(weight).max(axis=0)
     return {
         "hit_rate": float(hit.mean()),
         "log_score": float(score.mean()),

@@ -12,8 +12,9 @@ import math
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
+from selfcal.base.grid import Array
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import LEVEL_SD, Answer, Floats, Problem, Value, ln_moments, logarithmic
+from selfcal.studies.methods.problem import FIRST_LEVEL_SD, Answer, Problem, Value, ln_moments, logarithmic
 
 
 def ekf(problem: Problem) -> Answer:
@@ -31,17 +32,17 @@ def _run(problem: Problem, law: str, *, unscented: bool) -> dict[str, Value]:
     prior = [ln_moments(problem.group.priors[name]) for name in NAMED[law].parameters]
     mean = np.array([0.0, 0.0, *(m for m, _ in prior)])
     start = {"random_walk": 0.0, "gauss_markov": math.exp(prior[1][0])}[law]
-    sd = np.array([LEVEL_SD * float(y.std()), start, *(s for _, s in prior)])
+    sd = np.array([FIRST_LEVEL_SD * float(y.std()), start, *(s for _, s in prior)])
     d = mean.size
 
-    def phi(x: Floats) -> float:
+    def phi(x: Array) -> float:
         return math.exp(-min(math.exp(min(x[4], 50.0)) * dt, 700.0)) if law == "gauss_markov" else 1.0
 
-    def step_variance(x: Floats) -> float:
+    def step_variance(x: Array) -> float:
         size = math.exp(2.0 * min(x[3], 50.0))
         return size * (1.0 - phi(x) ** 2) if law == "gauss_markov" else size * dt
 
-    def move(x: Floats, _dt: float) -> Floats:
+    def move(x: Array, _dt: float) -> Array:
         moved = x.copy()
         moved[1] *= phi(x)
         return moved

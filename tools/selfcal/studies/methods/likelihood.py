@@ -9,8 +9,9 @@ import numpy as np
 from scipy import optimize
 from statsmodels.tsa.statespace.structural import UnobservedComponents
 
+from selfcal.base.grid import Array
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, information_criteria, logarithmic
+from selfcal.studies.methods.problem import Answer, Problem, Value, information_criteria, logarithmic
 
 #: Names of the laws in statsmodels. All have a free level, so their likelihoods are of the same samples.
 _MODEL = {"constant": {"level": "dconstant"}, "random_walk": {"level": "llevel"}}
@@ -37,10 +38,10 @@ def maximum_likelihood(problem: Problem) -> Answer:
     return Answer(estimates, information_criteria(ln_likelihood, y.size))
 
 
-def _continuous(law: str, fitted: Floats, covariance: Floats, scale: float, dt_s: float) -> dict[str, Value]:
+def _continuous(law: str, fitted: Array, covariance: Array, scale: float, dt_s: float) -> dict[str, Value]:
     """Parameters of continuous time; the interval by the derivatives of their logarithms."""
 
-    def ln_of(p: Floats) -> Floats:
+    def ln_of(p: Array) -> Array:
         N = 0.5 * _ln(p[0] * scale**2 * dt_s)
         if law == "constant":
             return np.array([N])

@@ -12,14 +12,15 @@ import math
 import numpy as np
 from filterpy.kalman import KalmanFilter, MMAEFilterBank
 
+from selfcal.base.grid import Array
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.grid import ln_density, ln_limits
-from selfcal.studies.methods.problem import LEVEL_SD, Answer, Floats, Problem, Value
+from selfcal.studies.methods.dense_grid import ln_density, ln_limits
+from selfcal.studies.methods.problem import FIRST_LEVEL_SD, Answer, Problem, Value
 
 #: Nodes of the drift's parameter and of alpha, each in the middle of a cell of the prior's range.
 NODES: dict[str, tuple[int, ...]] = {"constant": (), "random_walk": (12,), "gauss_markov": (6, 6)}
 #: The least white noise of a node, as a part of the variance of the differences.
-LEAST = 1e-4
+WHITE_SHARE_LEAST = 1e-4
 
 
 def mmae(problem: Problem) -> Answer:
@@ -38,13 +39,13 @@ def mmae(problem: Problem) -> Answer:
     )
 
 
-def edges(problem: Problem, law: str) -> list[Floats]:
+def edges(problem: Problem, law: str) -> list[Array]:
     """Edges of the cells in ln, for each parameter but the white noise."""
     priors = [problem.group.priors[name] for name in NAMED[law].parameters[1:]]
     return [np.linspace(*ln_limits(prior), count + 1) for prior, count in zip(priors, NODES[law], strict=True)]
 
 
-def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
+def nodes(problem: Problem, law: str) -> tuple[Array, Array]:
     """Parameters [d, m] and prior mass [m] of the nodes."""
     priors = [problem.group.priors[name] for name in NAMED[law].parameters[1:]]
     middles = [0.5 * (edge[:-1] + edge[1:]) for edge in edges(problem, law)]
@@ -57,16 +58,16 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
     elif law == "gauss_markov":
         drift = -2.0 * np.exp(2.0 * ln[0]) * np.expm1(-np.exp(ln[1]) * problem.dt_s)
     total = float((np.diff(problem.y) ** 2).mean())
-    white = np.sqrt(0.5 * problem.dt_s * np.maximum(total - drift, LEAST * total))
+    white = np.sqrt(0.5 * problem.dt_s * np.maximum(total - drift, WHITE_SHARE_LEAST * total))
     return np.concatenate([white[None], np.exp(ln)]), mass / mass.sum()
 
 
-def kalman_filter(problem: Problem, law: str, theta: Floats) -> KalmanFilter:
+def kalman_filter(problem: Problem, law: str, theta: Array) -> KalmanFilter:
     """Level and drift at one node."""
     kalman = KalmanFilter(dim_x=2, dim_z=1)
     kalman.H = np.ones((1, 2))
     kalman.R = np.array([[theta[0] ** 2 / problem.dt_s]])
-    kalman.P = np.diag([(LEVEL_SD * float(problem.y.std())) ** 2, 0.0])
+    kalman.P = np.diag([(FIRST_LEVEL_SD * float(problem.y.std())) ** 2, 0.0])
     phi, variance = problem.step(law, np.log(theta))
     kalman.F, kalman.Q = np.diag([1.0, float(phi)]), np.diag([0.0, float(variance)])
     if law == "gauss_markov":
@@ -74,7 +75,7 @@ def kalman_filter(problem: Problem, law: str, theta: Floats) -> KalmanFilter:
     return kalman
 
 
-def estimates(problem: Problem, law: str, theta: Floats, weight: Floats) -> dict[str, Value]:
+def estimates(problem: Problem, law: str, theta: Array, weight: Array) -> dict[str, Value]:
     """Of each parameter the median and the interval, its density flat in ln within a cell. A law whose weight is no
     longer a number of the machine has none."""
     if not weight.any():

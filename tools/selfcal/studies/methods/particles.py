@@ -8,13 +8,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, probabilities, weighted
+from selfcal.studies.methods.problem import Answer, Problem, Value, probabilities, weighted
 
 #: The state [s, particles] after the first reading, from a record, a law and ln parameters [d, particles].
-Begin = Callable[[Problem, str, Floats, np.random.Generator], Floats]
+Begin = Callable[[Problem, str, Array, np.random.Generator], Array]
 #: ln likelihood [particles] of a reading and the state after it, from the same, the state and the reading.
-Step = Callable[[Problem, str, Floats, Floats, float, np.random.Generator], tuple[Floats, Floats]]
+Step = Callable[[Problem, str, Array, Array, float, np.random.Generator], tuple[Array, Array]]
 
 #: Particles a law.
 PARTICLES = 2000
@@ -24,10 +25,10 @@ SHRINK = (3.0 * 0.99 - 1.0) / (2.0 * 0.99)
 
 def particles(problem: Problem) -> Answer:
     """Weighted medians and quantiles of the last particles, laws by their evidence."""
-    return answer(problem, begin, step)
+    return particle_answer(problem, begin, step)
 
 
-def answer(problem: Problem, begin: Begin, step: Step) -> Answer:
+def particle_answer(problem: Problem, begin: Begin, step: Step) -> Answer:
     """What the particles find for each law, each with the same seed."""
     estimates: dict[str, dict[str, Value]] = {}
     ln_evidence: dict[str, float] = {}
@@ -37,7 +38,7 @@ def answer(problem: Problem, begin: Begin, step: Step) -> Answer:
     return Answer(estimates, probabilities(ln_evidence))
 
 
-def filtered(problem: Problem, law: str, begin: Begin, step: Step) -> tuple[Floats, Floats, float]:
+def filtered(problem: Problem, law: str, begin: Begin, step: Step) -> tuple[Array, Array, float]:
     """ln parameters [d, particles], their weights, and the ln evidence of all samples but the first, which gives the
     level."""
     rng = np.random.default_rng(1)
@@ -68,7 +69,7 @@ def filtered(problem: Problem, law: str, begin: Begin, step: Step) -> tuple[Floa
     return ln_theta, weight / weight.sum(), evidence
 
 
-def begin(problem: Problem, law: str, ln_theta: Floats, rng: np.random.Generator) -> Floats:
+def begin(problem: Problem, law: str, ln_theta: Array, rng: np.random.Generator) -> Array:
     """Level and drift [2, particles] after the first reading."""
     level = problem.y[0] + np.exp(ln_theta[0]) / math.sqrt(problem.dt_s) * rng.standard_normal(PARTICLES)
     drift = np.zeros(PARTICLES)
@@ -78,8 +79,8 @@ def begin(problem: Problem, law: str, ln_theta: Floats, rng: np.random.Generator
 
 
 def step(
-    problem: Problem, law: str, ln_theta: Floats, state: Floats, value: float, rng: np.random.Generator
-) -> tuple[Floats, Floats]:
+    problem: Problem, law: str, ln_theta: Array, state: Array, value: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
     """ln likelihood of a reading [particles], and the state, whose drift is drawn."""
     level, drift = state
     phi, variance = problem.step(law, ln_theta)

@@ -8,23 +8,20 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
-from selfcal.adequacy.allan import LONGEST, Terms, overlapping, terms_of
-from selfcal.bank.result import HALF_90
-from selfcal.base.grid import weighted_quantiles
+from selfcal.adequacy.allan import AVERAGES_LEAST, AllanTerms, allan_terms, overlapping_variance
+from selfcal.bank.axis_result import HALF_90
+from selfcal.base.grid import Array, weighted_quantiles
 from selfcal.model.file import Group, Prior
 from selfcal.model.laws import NAMED
 
-Floats = NDArray[np.float64]
-
 #: The search leaves no start by more than this factor: beyond it the likelihood is flat or overflows.
-REACH = 1e5
+START_REACH = 1e5
 #: Step in the ln of a parameter for a curvature: a smaller one shows the rounding of an Allan variance.
 STEP = 0.01
 #: Sd of the first level of a Kalman filter, in sd of the record; the level begins at the first reading.
-LEVEL_SD = 10.0
+FIRST_LEVEL_SD = 10.0
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class Problem:
     """Bank samples `y` [n] every `dt_s`, without a gap, in the group's unit. The priors are those of `group`; a rival
     without priors does not look at them."""
 
-    y: Floats
+    y: Array
     dt_s: float
     group: Group
     laws: tuple[str, ...]
@@ -42,12 +39,12 @@ class Problem:
         """The laws with a drift."""
         return tuple(law for law in self.laws if law != "constant")
 
-    def terms(self, law: str, ln_theta: Floats) -> Terms:
+    def terms(self, law: str, ln_theta: Array) -> AllanTerms:
         """The law at the logarithms of its parameters."""
         theta = dict(zip(NAMED[law].parameters, np.exp(ln_theta).tolist(), strict=True))
-        return terms_of(NAMED[law], theta, self.dt_s)
+        return allan_terms(NAMED[law], theta, self.dt_s)
 
-    def step(self, law: str, ln_theta: Floats) -> tuple[Floats, Floats]:
+    def step(self, law: str, ln_theta: Array) -> tuple[Array, Array]:
         """What remains of the drift after a sample, and the variance of what is added, at ln parameters [d, ...]."""
         ones = np.ones(ln_theta.shape[1:])
         if law == "random_walk":
@@ -57,7 +54,7 @@ class Problem:
             return np.exp(-rate), np.exp(2.0 * ln_theta[1]) * -np.expm1(-2.0 * rate)
         return ones, 0.0 * ones
 
-    def starts(self, law: str) -> list[Floats]:
+    def starts(self, law: str) -> list[Array]:
         """Where a search begins: moments of the record, and for Gauss-Markov three correlation times."""
         n, dt = self.y.size, self.dt_s
         white = max(float(np.diff(self.y).std()) / math.sqrt(2.0), 1e-12 * float(np.abs(self.y).max()), 1e-30)
@@ -65,12 +62,12 @@ class Problem:
         if law == "constant":
             return [np.log([N])]
         m = max(2, n // 10)
-        long = math.sqrt(max(overlapping(self.y, m)[0] - white**2 / m, 0.01 * white**2))
+        long = math.sqrt(max(overlapping_variance(self.y, m)[0] - white**2 / m, 0.01 * white**2))
         if law == "random_walk":
             return [np.log([N, long * math.sqrt(3.0 / (m * dt))])]
         return [np.log([N, long, 1.0 / (part * n * dt)]) for part in (0.2, 0.03, 0.005)]
 
-    def peaks(self, objective: Callable[[str, Floats], float], points: float = math.inf) -> dict[str, Peak]:
+    def peaks(self, objective: Callable[[str, Array], float], points: float = math.inf) -> dict[str, Peak]:
         """The maximum of an objective of a law and ln parameters, by law; of laws that so many points determine."""
         return {law: maximum(partial(objective, law), self.starts(law)) for law in self.determined(points)}
 
@@ -78,11 +75,11 @@ class Problem:
         """The laws that have no more parameters than points of a curve."""
         return [law for law in self.laws if points >= len(NAMED[law].parameters)]
 
-    def octaves(self) -> tuple[Floats, Floats]:
+    def octaves(self) -> tuple[Array, Array]:
         """Averaging times in readings, an octave apart, and overlapping Allan variances."""
         y = self.y - self.y.mean()
-        m = np.exp2(np.arange(max(1, math.floor(math.log2(max(2, y.size // LONGEST))) + 1)))
-        return m, np.array([overlapping(y, int(length))[0] for length in m])
+        m = np.exp2(np.arange(max(1, math.floor(math.log2(max(2, y.size // AVERAGES_LEAST))) + 1)))
+        return m, np.array([overlapping_variance(y, int(length))[0] for length in m])
 
 
 @dataclass(frozen=True)
@@ -111,16 +108,16 @@ class Answer:
 class Peak:
     """A maximum of an objective: its place in ln parameters, the value, and the inverse of the curvature there."""
 
-    at: Floats
+    at: Array
     value: float
-    covariance: Floats
+    covariance: Array
 
     def values(self, law: str) -> dict[str, Value]:
         """Estimates with the interval of a normal distribution in the logarithm."""
         return logarithmic(NAMED[law].parameters, self.at, self.covariance)
 
 
-def logarithmic(names: Sequence[str], ln_value: Floats, covariance: Floats) -> dict[str, Value]:
+def logarithmic(names: Sequence[str], ln_value: Array, covariance: Array) -> dict[str, Value]:
     """Estimates from logarithms and their covariance. A variance that is not positive gives no interval."""
     values = {}
     for k, name in enumerate(names):
@@ -131,7 +128,7 @@ def logarithmic(names: Sequence[str], ln_value: Floats, covariance: Floats) -> d
     return values
 
 
-def weighted(names: Sequence[str], ln_theta: Floats, weight: Floats) -> dict[str, Value]:
+def weighted(names: Sequence[str], ln_theta: Array, weight: Array) -> dict[str, Value]:
     """Weighted medians with 5 % and 95 % points of ln parameters [d, m]; `weight` [m] sums to 1."""
     parameters = {}
     for name, column in zip(names, ln_theta, strict=True):
@@ -151,10 +148,10 @@ def root(square: float) -> Value:
     return Value(math.sqrt(float(square)) if square > 0.0 else math.nan)
 
 
-def maximum(objective: Callable[[Floats], float], starts: Sequence[Floats]) -> Peak:
+def maximum(objective: Callable[[Array], float], starts: Sequence[Array]) -> Peak:
     """The highest of the local maxima that the search finds from `starts`, by L-BFGS with numerical derivatives."""
-    best: tuple[float, Floats] | None = None
-    reach = math.log(REACH)
+    best: tuple[float, Array] | None = None
+    reach = math.log(START_REACH)
     for start in starts:
         bounds = [(value - reach, value + reach) for value in start]
         with np.errstate(all="ignore"):
@@ -169,7 +166,7 @@ def maximum(objective: Callable[[Floats], float], starts: Sequence[Floats]) -> P
     return Peak(best[1], best[0], inverse(curvature))
 
 
-def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
+def hessian(objective: Callable[[Array], float], theta: Array) -> Array:
     """Second derivatives by central differences."""
     d = theta.size
     step = np.eye(d) * STEP
@@ -184,7 +181,7 @@ def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
     return matrix
 
 
-def inverse(information: Floats) -> Floats:
+def inverse(information: Array) -> Array:
     """The inverse of a positive definite matrix; NaN for another one: the record does not determine the parameters."""
     try:
         np.linalg.cholesky(information)

@@ -10,16 +10,17 @@ import math
 
 import numpy as np
 
-from selfcal.studies.methods.particles import PARTICLES, answer
-from selfcal.studies.methods.problem import Answer, Floats, Problem
+from selfcal.base.grid import Array
+from selfcal.studies.methods.particles import PARTICLES, particle_answer
+from selfcal.studies.methods.problem import Answer, Problem
 
 
 def rao_blackwell(problem: Problem) -> Answer:
     """Weighted medians and quantiles of the last particles, laws by their evidence."""
-    return answer(problem, begin, step)
+    return particle_answer(problem, begin, step)
 
 
-def begin(problem: Problem, law: str, ln_theta: Floats, _rng: np.random.Generator) -> Floats:
+def begin(problem: Problem, law: str, ln_theta: Array, _rng: np.random.Generator) -> Array:
     """Level, drift, and their variances and covariance [5, particles] after the first reading, which gives the sum of
     level and drift."""
     noise = np.exp(2.0 * ln_theta[0]) / problem.dt_s
@@ -28,8 +29,8 @@ def begin(problem: Problem, law: str, ln_theta: Floats, _rng: np.random.Generato
 
 
 def step(
-    problem: Problem, law: str, ln_theta: Floats, state: Floats, value: float, _rng: np.random.Generator
-) -> tuple[Floats, Floats]:
+    problem: Problem, law: str, ln_theta: Array, state: Array, value: float, _rng: np.random.Generator
+) -> tuple[Array, Array]:
     """ln likelihood of a reading [particles], and the state after it. Nothing is drawn."""
     level, drift, level_variance, drift_variance, both = state
     phi, added = problem.step(law, ln_theta)

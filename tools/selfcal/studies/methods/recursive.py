@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from selfcal.studies.methods.problem import Answer, Floats, Problem, of_coefficients
+from selfcal.base.grid import Array
+from selfcal.studies.methods.problem import Answer, Problem, of_coefficients
 
 #: Forgetting of the first sample, and the share that each further sample keeps of it: the early errors are poor.
 FORGET, KEEP = 0.05, 0.99
@@ -27,7 +28,7 @@ def recursive_least_squares(problem: Problem) -> Answer:
     return Answer(by_law)
 
 
-def coefficients(y: Floats, *, pole: bool) -> tuple[float, float, float]:
+def coefficients(y: Array, *, pole: bool) -> tuple[float, float, float]:
     """phi, theta and the variance of e in y[k] = phi y[k-1] + e[k] + theta e[k-1] + constant, in one pass. Without a
     `pole` phi is 1 for the sum of y and there is no constant."""
     d = 3 if pole else 1
@@ -44,7 +45,7 @@ def coefficients(y: Floats, *, pole: bool) -> tuple[float, float, float]:
     return float(x[1]) if pole else 1.0, float(x[0]), square / y.size
 
 
-def update(x: Floats, P: Floats, gradient: Floats, error: float, kept: float = 1.0) -> tuple[Floats, Floats]:
+def update(x: Array, P: Array, gradient: Array, error: float, kept: float = 1.0) -> tuple[Array, Array]:
     """One step of recursive least squares: coefficients and covariance after a prediction `error`. `kept`: the weight
     of all earlier samples."""
     gain = P @ gradient / (kept + float(gradient @ P @ gradient))

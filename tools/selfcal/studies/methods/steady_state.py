@@ -9,7 +9,8 @@ from functools import partial
 import numpy as np
 from scipy import signal
 
-from selfcal.studies.methods.problem import Answer, Floats, Problem
+from selfcal.base.grid import Array
+from selfcal.studies.methods.problem import Answer, Problem
 
 
 def steady_state(problem: Problem) -> Answer:
@@ -17,7 +18,7 @@ def steady_state(problem: Problem) -> Answer:
     return Answer.of(problem.peaks(partial(ln_likelihood, problem)))
 
 
-def ln_likelihood(problem: Problem, law: str, ln_theta: Floats) -> float:
+def ln_likelihood(problem: Problem, law: str, ln_theta: Array) -> float:
     """Of all samples but the first, or about the best constant where the law has a mean."""
     y = problem.y
     r = math.exp(2.0 * ln_theta[0]) / problem.dt_s

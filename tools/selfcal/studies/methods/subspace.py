@@ -11,11 +11,12 @@ import numpy as np
 from scipy import linalg
 from statsmodels.tsa.stattools import levinson_durbin
 
-from selfcal.studies.methods.autocorrelation import PART
-from selfcal.studies.methods.problem import Answer, Floats, Problem, of_coefficients
+from selfcal.base.grid import Array
+from selfcal.studies.methods.autocorrelation import LAGS_SHARE
+from selfcal.studies.methods.problem import Answer, Problem, of_coefficients
 
-#: Lags at most; of a short record PART: as many parameters take ten samples each.
-MOST = 60
+#: Lags at most; of a short record LAGS_SHARE: as many parameters take ten samples each.
+LAGS_MOST = 60
 
 
 def subspace(problem: Problem) -> Answer:
@@ -29,15 +30,15 @@ def subspace(problem: Problem) -> Answer:
     return Answer(by_law)
 
 
-def lags(y: Floats) -> int:
+def lags(y: Array) -> int:
     """Twice the order of an autoregression by AIC (Bauer, Econometric Theory 21, 2005)."""
-    most = max(2, min(MOST, round(PART * y.size)))
+    most = max(2, min(LAGS_MOST, round(LAGS_SHARE * y.size)))
     partial = levinson_durbin(y, most)[2][1:]
     criterion = y.size * np.cumsum(np.log1p(-(partial**2))) + 2.0 * np.arange(1, most + 1)
     return min(2 * (int(np.argmin(criterion)) + 1), most)
 
 
-def realization(y: Floats, count: int) -> tuple[float, float, float]:
+def realization(y: Array, count: int) -> tuple[float, float, float]:
     """Pole, gain (as y sees it) and innovation variance of x[k+1] = pole x[k] + gain e[k], y[k] = x[k] + e[k]."""
     hankel = np.lib.stride_tricks.sliding_window_view(y, 2 * count).T
     past, future = hankel[:count], hankel[count:]

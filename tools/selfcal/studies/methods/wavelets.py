@@ -12,16 +12,16 @@ from functools import partial
 
 import numpy as np
 
-from selfcal.adequacy.allan import Terms
-from selfcal.base.grid import SLOPE_STEP
+from selfcal.adequacy.allan import AllanTerms
+from selfcal.base.grid import SLOPE_STEP, Array
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, inverse, logarithmic, maximum
+from selfcal.studies.methods.problem import Answer, Problem, Value, inverse, logarithmic, maximum
 
 #: Weights of a second difference of sums over m readings.
 _SECOND = ((0, 1.0), (1, -2.0), (2, 1.0))
 
 
-def covariance(terms: Terms, m: Floats, n: int) -> Floats:
+def covariance(terms: AllanTerms, m: Array, n: int) -> Array:
     """Of the overlapping Allan variances [t, t] at `m` readings of a normal record of `n`: twice the sum of the squared
     covariances of the differences behind them."""
     covariance = np.empty((m.size, m.size))
@@ -42,10 +42,10 @@ def gmwm(problem: Problem) -> Answer:
     by_law: dict[str, dict[str, Value]] = {}
     for law in problem.determined(m.size):
 
-        def model(ln_theta: Floats, law: str = law) -> Floats:
+        def model(ln_theta: Array, law: str = law) -> Array:
             return problem.terms(law, ln_theta).allan_variance(m)
 
-        def objective(weight: Floats, ln_theta: Floats, model: Callable[[Floats], Floats] = model) -> float:
+        def objective(weight: Array, ln_theta: Array, model: Callable[[Array], Array] = model) -> float:
             off = variance - model(ln_theta)
             return -0.5 * float(off @ weight @ off)
 

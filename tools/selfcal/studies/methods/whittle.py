@@ -12,7 +12,8 @@ import math
 import numpy as np
 from scipy import fft
 
-from selfcal.studies.methods.problem import Answer, Floats, Problem, information_criteria
+from selfcal.base.grid import Array
+from selfcal.studies.methods.problem import Answer, Problem, information_criteria
 
 
 def whittle(problem: Problem) -> Answer:
@@ -21,7 +22,7 @@ def whittle(problem: Problem) -> Answer:
     power = fft.dct(problem.y - problem.y.mean(), norm="ortho")[1:] ** 2
     omega = math.pi * np.arange(1, n) / n
 
-    def objective(law: str, ln_theta: Floats) -> float:
+    def objective(law: str, ln_theta: Array) -> float:
         spectrum = problem.terms(law, ln_theta).spectrum(omega)
         return -0.5 * float((np.log(spectrum) + power / spectrum).sum())
 

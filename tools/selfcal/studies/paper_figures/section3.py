@@ -11,9 +11,9 @@ from statistics import NormalDist
 import numpy as np
 from scipy import signal
 
-from selfcal.adequacy.allan import terms_of
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
-from selfcal.bank.result import AxisResult
+from selfcal.adequacy.allan import allan_terms
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
+from selfcal.bank.axis_result import AxisResult
 from selfcal.base.grid import Array
 from selfcal.batch.spread import Row, spread
 from selfcal.model.file import DEFAULT, Model, settings_of
@@ -21,7 +21,7 @@ from selfcal.model.laws import NAMED
 from selfcal.model.tables import make_tables
 from selfcal.readings.budget import FALSE_ALARM
 from selfcal.show.chart import Band, Curve, Figure, Panel
-from selfcal.studies.methods.allan import curve, fit
+from selfcal.studies.methods.allan_fits import curve, fit_weighted
 from selfcal.studies.methods.problem import Problem
 from selfcal.studies.methods.whittle import whittle
 from selfcal.studies.paper_figures.reproduction import Reproduction
@@ -74,7 +74,7 @@ def rows_of(model: Model, job: tuple[str, int]) -> list[Row]:
     """A row for each mark of a record, and one of the prior, at 0."""
     law, seed = job
     group = model.group_of("gx")
-    truth = draw(group, law, np.random.default_rng([seed, list(NAMED).index(law)]))
+    truth = draw_parameters(group, law, np.random.default_rng([seed, list(NAMED).index(law)]))
     y, _ = simulate_bank_samples(law, truth, 1.0, MARKS[-1], own_seed(law, seed))
     count = len(model.hypotheses)
     start: Row = {"law": law, "t": 0, "p": 1.0 / count, "wrong": law != next(iter(model.hypotheses))}
@@ -189,7 +189,7 @@ def choices(seed: int) -> dict[str, float]:
         for k in range(CHOICES):
             y, _ = simulate_bank_samples(law, truth, 1.0, ALIKE_SAMPLES, own_seed(law, seed + 1 + k))
             problem = Problem(y, 1.0, model.group_of("gx"), tuple(ALIKE))
-            for tool, answer in (("spectrum", whittle(problem)), ("Allan deviation", fit(problem))):
+            for tool, answer in (("spectrum", whittle(problem)), ("Allan deviation", fit_weighted(problem))):
                 weight = answer.weights["AIC"]
                 wrong[tool] += max(weight, key=lambda name: weight[name]) != law
             wrong["bank"] += over_time(model, "gx", 1.0, y, [ALIKE_SAMPLES])[0].best != law
@@ -203,7 +203,7 @@ def figures_3_and_4(seed: int) -> list[Reproduction]:
     deviations: list[Panel] = []
     for letter, (law, name) in zip("ab", SHOWN.items(), strict=True):
         y, _ = simulate_bank_samples(law, ALIKE[law], 1.0, ALIKE_SAMPLES, own_seed(law, seed))
-        terms = terms_of(NAMED[law], ALIKE[law], 1.0)
+        terms = allan_terms(NAMED[law], ALIKE[law], 1.0)
         f, power = (values[1:-1] for values in signal.welch(y, nperseg=PIECE, detrend="constant"))
         m, deviation, _ = curve(Problem(y, 1.0, group, tuple(ALIKE)))
         for panels, x, estimated, true, x_label, y_label in (

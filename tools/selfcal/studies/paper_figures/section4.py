@@ -11,14 +11,14 @@ import numpy as np
 
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.adequacy.summary import NOISIER
-from selfcal.bank.result import HALF_90, AxisResult, Estimate
+from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.base.grid import Array
 from selfcal.logs.recording import as_float, load
 from selfcal.model.file import Model, Prior
 from selfcal.model.laws import NAMED
 from selfcal.model.tables import Tables, make_tables
 from selfcal.show.chart import Band, Curve, Figure, Panel
-from selfcal.studies.methods.allan import fit
+from selfcal.studies.methods.allan_fits import fit_weighted
 from selfcal.studies.methods.problem import Problem, Value
 from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.studies.paper_figures.section3 import PAPER, by_chance, over_time
@@ -132,7 +132,7 @@ def by_allan(model: Model, law: str, seed: int) -> dict[tuple[str, str], Rms]:
     group = replace(model.group_of(AXIS), axes=(AXIS,))
     laws = tuple(model.hypotheses)
     drawn = _drawn(law, TRUTHS[law], seed, SCATTER)
-    fits = [[fit(Problem(y[:mark], 1.0, group, laws)).estimates for mark in ALLAN_MARKS] for y in drawn]
+    fits = [[fit_weighted(Problem(y[:mark], 1.0, group, laws)).estimates for mark in ALLAN_MARKS] for y in drawn]
     spreads = {}
     for filtered in laws:
         for name, true in _compared(law, TRUTHS[law], filtered).items():
@@ -315,7 +315,10 @@ def figures_7(model: Model, records: Mapping[str, Array], seed: int) -> list[Rep
     group = replace(model.group_of(AXIS), axes=(AXIS,))
     t = np.array(ALLAN_MARKS, dtype=float)
     fits = {
-        title: [fit(Problem(y[:mark], 1.0, group, ("random_walk",))).estimates["random_walk"] for mark in ALLAN_MARKS]
+        title: [
+            fit_weighted(Problem(y[:mark], 1.0, group, ("random_walk",))).estimates["random_walk"]
+            for mark in ALLAN_MARKS
+        ]
         for title, y in records.items()
     }
     allan = {law: by_allan(model, law, seed + 17) for law in TRUTHS}

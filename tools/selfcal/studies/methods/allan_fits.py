@@ -6,11 +6,12 @@ import math
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, weights
+from selfcal.studies.methods.problem import Answer, Problem, Value, weights
 
 
-def curve(problem: Problem) -> tuple[Floats, Floats, Floats]:
+def curve(problem: Problem) -> tuple[Array, Array, Array]:
     """Averaging times in readings, overlapping Allan deviations, and equivalent degrees of freedom (white noise,
     Riley's approximation N (1/m) 4m^2/(4m^2+5) of NIST SP 1065)."""
     n = problem.y.size
@@ -37,13 +38,13 @@ def slopes(problem: Problem) -> Answer:
     return Answer({"random_walk": {"N": N, "K": K}} if "random_walk" in problem.laws else {"constant": {"N": N}})
 
 
-def fit(problem: Problem) -> Answer:
+def fit_weighted(problem: Problem) -> Answer:
     """Weighted least squares in the logarithm of the Allan variance, each point with its own degrees of freedom. The
     points count as independent, as is the practice. Laws are weighed by AIC of this fit."""
     m, deviation, freedom = curve(problem)
     ln_variance = 2.0 * np.log(deviation)
 
-    def objective(law: str, ln_theta: Floats) -> float:
+    def objective(law: str, ln_theta: Array) -> float:
         model = np.log(problem.terms(law, ln_theta).allan_variance(m))
         return -0.25 * float((freedom * (ln_variance - model) ** 2).sum())
 

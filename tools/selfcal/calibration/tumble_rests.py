@@ -13,26 +13,26 @@ from scipy.stats import chi2
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask, block_means, runs
 from selfcal.base.units import factor
-from selfcal.calibration.noise import LONG_S, Noise, drift, measured, of_model, of_rest, rounding
-from selfcal.calibration.tumble_fit import Fit, Problem, fit, linearized
+from selfcal.calibration.noise import LONG_S, Noise, drift, measured_noise, of_model, of_rest, rounding_variance
+from selfcal.calibration.tumble_fit import Problem, TumbleFit, fit_tumble, linearized
 from selfcal.logs.recording import Recording, bridged, check_column
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of
-from selfcal.readings.rest import FEWEST, PIECE_S, rest_of
+from selfcal.readings.rest import LEVEL_PIECE_S, PIECES_LEAST, rest_of
 
 ACCEL, GYRO = ("ax", "ay", "az"), ("gx", "gy", "gz")
 UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
 #: Time that is cut off a rest next to a motion, s: its first and last movement is below the noise of a piece.
-SETTLE_S = PIECE_S
+SETTLE_S = LEVEL_PIECE_S
 #: Shortest rest that is advised, s, and what the search for motion takes off both ends of one at most, s.
-REST_S, CUT_S = 10.0, 6.0 * PIECE_S
+REST_LEAST_S, CUT_S = 10.0, 6.0 * LEVEL_PIECE_S
 #: Most rests: the fit is dense.
-MOST = 200
+RESTS_MOST = 200
 #: Number of pieces of a rest: the fewest whose differences show its drift.
-PIECES = FEWEST
+REST_PIECES = PIECES_LEAST
 #: Shares of a drift's mean square under a wide prior that are weighed: nearly four decades of its deviation, up to its
 #: limit. Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
-SHARES, RESTLESS = 10.0 ** (1.5 - np.arange(0.0, 8.0, 0.75)), 10.0
+PRIOR_SHARES, RESTLESS = 10.0 ** (1.5 - np.arange(0.0, 8.0, 0.75)), 10.0
 #: Assumed time between two logs without stamps of one clock, s.
 BETWEEN_S = 60.0
 
@@ -41,7 +41,7 @@ BETWEEN_S = 60.0
 class Rest:
     """A rest: `log` and its time in it, s, its `begin_s` and `end_s` on the clock of all logs, `seconds` of readings
     in it; means `accel` [3], m/s^2, and `gyro` [3], rad/s, NaN without gyros; `temp`, degC, or NaN; `rounded` [6]:
-    variance of the means by a lattice that the noise does not dither; `pieces` [PIECES, 6]: means of equal parts."""
+    variance of the means by a lattice that the noise does not dither; `pieces` [REST_PIECES, 6]: means of parts."""
 
     log: int
     at_s: tuple[float, float]
@@ -96,37 +96,37 @@ class Tumble:
     def fitted(
         self, names: Sequence[str], problem_of: Callable[[Tumble], Problem], start: Array, mean: Array, prior: Array,
         held: Mask | None = None,
-    ) -> tuple[Fit, Tumble]:  # fmt: skip
+    ) -> tuple[TumbleFit, Tumble]:  # fmt: skip
         """The fit, and the tumble with the wide drift of axes as this log has it: posterior means of the variances of
         its terms. Before, each term by itself is as likely, and its deviation uniform. A prior of its logarithm would
-        be decided by the least of SHARES, which no log contradicts (Gelman 2006). A rest in which the mount moved is
-        no drift's: none counts for more than RESTLESS."""
+        be decided by the least of PRIOR_SHARES, which no log contradicts (Gelman 2006). A rest in which the mount moved
+        is no drift's: none counts for more than RESTLESS."""
         weighed, count = self, self.wide(names)
         if count:
-            middle = self.with_drift(names, np.full(count, SHARES[SHARES.size // 2]))
-            start = fit(problem_of(middle), start, mean, prior, held).theta
-            tried = [[self.with_drift(names, share * term) for share in SHARES] for term in np.eye(count)]
+            middle = self.with_drift(names, np.full(count, PRIOR_SHARES[PRIOR_SHARES.size // 2]))
+            start = fit_tumble(problem_of(middle), start, mean, prior, held).theta
+            tried = [[self.with_drift(names, share * term) for share in PRIOR_SHARES] for term in np.eye(count)]
             within = np.array([[tumble.within(names) for tumble in row] for row in tried])
             likely = np.maximum(within - within.max(axis=(0, 1)), -RESTLESS).sum(axis=2)
             problems = [[problem_of(tumble) for tumble in row] for row in tried]
             likely += [[linearized(p, start, mean, prior, held).evidence for p in row] for row in problems]
-            weight = np.sqrt(SHARES) * np.exp(likely - likely.max())
-            weighed = self.with_drift(names, weight @ SHARES / weight.sum())
-        return fit(problem_of(weighed), start, mean, prior, held), weighed
+            weight = np.sqrt(PRIOR_SHARES) * np.exp(likely - likely.max())
+            weighed = self.with_drift(names, weight @ PRIOR_SHARES / weight.sum())
+        return fit_tumble(problem_of(weighed), start, mean, prior, held), weighed
 
     def _pieces(self, names: Sequence[str]) -> Iterator[tuple[int, Array, Array]]:
-        """Number, pieces [PIECES] and their covariance, less their common part, of each rest and axis."""
+        """Number, pieces [REST_PIECES] and their covariance, less their common part, of each rest and axis."""
         for k, name in enumerate(ACCEL + GYRO):
             for n, rest in enumerate(self.rests if name in names else ()):
-                edges = np.linspace(rest.begin_s, rest.end_s, PIECES + 1)
+                edges = np.linspace(rest.begin_s, rest.end_s, REST_PIECES + 1)
                 C = drift(self.noise[name], edges[:-1], edges[1:], rest.end_s)
-                white = self.noise[name].white * PIECES / rest.seconds + rest.rounded[k]
+                white = self.noise[name].white * REST_PIECES / rest.seconds + rest.rounded[k]
                 if np.isfinite(rest.pieces[:, k]).all():
-                    yield n, rest.pieces[:, k], C + white * np.eye(PIECES)
+                    yield n, rest.pieces[:, k], C + white * np.eye(REST_PIECES)
 
     def within(self, names: Sequence[str]) -> Array:
         """ln of the likelihood of the differences between neighbouring pieces of each rest [n], but for a constant."""
-        ln_likelihood, step = np.zeros(len(self.rests)), np.diff(np.eye(PIECES), axis=0)
+        ln_likelihood, step = np.zeros(len(self.rests)), np.diff(np.eye(REST_PIECES), axis=0)
         for n, x, C in self._pieces(names):
             d, R = step @ x, step @ C @ step.T
             ln_likelihood[n] -= 0.5 * float(d @ np.linalg.solve(R, d) + np.linalg.slogdet(R)[1])
@@ -134,7 +134,7 @@ class Tumble:
 
     def moved(self, names: Sequence[str]) -> Array:
         """Probability [n] that the halves of each rest are so far apart by chance, times the number of rests."""
-        square, halves = np.zeros(len(self.rests)), np.repeat([-1.0, 1.0], PIECES // 2)
+        square, halves = np.zeros(len(self.rests)), np.repeat([-1.0, 1.0], REST_PIECES // 2)
         for n, x, C in self._pieces(names):
             square[n] += float((halves @ x) ** 2 / (halves @ C @ halves))
         return np.asarray(len(self.rests) * chi2.sf(square, len(names)))
@@ -202,8 +202,8 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
     axes = ACCEL + gyros
     begins, notes = _begins(recordings)
     logs = [_log(recording, begin_s, axes) for recording, begin_s in zip(recordings, begins, strict=True)]
-    if sum(len(log.rests) for log in logs) > MOST:
-        raise UserError(f"more than {MOST} rests: choose a stretch with --start and --end")
+    if sum(len(log.rests) for log in logs) > RESTS_MOST:
+        raise UserError(f"more than {RESTS_MOST} rests: choose a stretch with --start and --end")
     ranges = {name: _range(model, name) if part_stated else math.inf for name in axes}
     rows_of = [(log, rows) for log in logs for rows in log.rests]
     typical = {
@@ -254,7 +254,7 @@ def _log(logged: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
         begin = begin_rest + SETTLE_S * (begin_rest > time[0])
         end = end_rest - SETTLE_S * any(abs(a - end_rest) < 0.5 / recording.rate_hz for a, _ in motion.moved)
         first, behind = (int(k) for k in np.searchsorted(time, [begin, end]))
-        if end - begin >= 2.0 * PIECE_S and behind - first >= PIECES:
+        if end - begin >= 2.0 * LEVEL_PIECE_S and behind - first >= REST_PIECES:
             rests.append(slice(first, behind))
     return _Log(recording, begin_s, own, whole, steps, temp, tuple(rests))
 
@@ -277,9 +277,9 @@ def _noise(logs: Sequence[_Log], name: str, model: Model, long_rest: Recording |
         return noise
     pieces = []
     for log in logs:
-        size = max(1, round(PIECE_S * log.recording.rate_hz))
+        size = max(1, round(LEVEL_PIECE_S * log.recording.rate_hz))
         pieces += [block_means(log.whole[name][rows], size) for rows in log.rests]
-    white = measured(pieces, PIECE_S)
+    white = measured_noise(pieces, LEVEL_PIECE_S)
     return of_model(model, name, UNITS[name], None if white is None else math.sqrt(white))
 
 
@@ -308,7 +308,7 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
     """The means of rows of a log."""
     recording, own = log.recording, log.own
     time = recording.time_s
-    cut = np.linspace(rows.start, rows.stop, PIECES + 1).astype(int).tolist()
+    cut = np.linspace(rows.start, rows.stop, REST_PIECES + 1).astype(int).tolist()
 
     def means(names: tuple[str, ...], part: slice) -> Array:
         present = [own[name][part][np.isfinite(own[name][part])] if name in own else np.zeros(0) for name in names]
@@ -318,7 +318,7 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
     for name in ACCEL + GYRO:
         step = log.steps.get(name, 0.0)
         scatter = float(np.var(log.whole[name][rows])) if name in own else 0.0
-        rounded.append(rounding(step, math.sqrt(max(scatter - step**2 / 12.0, 0.0))))
+        rounded.append(rounding_variance(step, math.sqrt(max(scatter - step**2 / 12.0, 0.0))))
     begin, end = float(time[rows.start]), float(time[rows.stop - 1]) + 1.0 / recording.rate_hz
     return Rest(
         number,

@@ -21,12 +21,12 @@ from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic, judged
 from selfcal.likelihood.fit import left
 from selfcal.likelihood.state import NET_LEAST, Look, State
-from selfcal.readings.budget import AXES, OF_MODULES
+from selfcal.readings.budget import AXES_COUNT, OF_MODULES
 
 #: Pictures of the checks of `identify`, by the beginning of their names.
 SHOWN = (("innovation_mean", "innovation_means"), ("innovation_ln_variance", "noise_level"))
 #: Probability that the statistics call an axis of a fitting record inadequate, and that a channel's coherence does.
-P_FAMILY, P_COHERENCE = (OF_MODULES[name] / AXES for name in ("statistics", "coherence"))
+P_FAMILY, P_COHERENCE = (OF_MODULES[name] / AXES_COUNT for name in ("statistics", "coherence"))
 #: A first ensemble screens: axes below this have a second one, which knows its tail, unless there is no doubt.
 P_SCREEN, P_CERTAIN, AGAIN = 2e-2, 1e-12, 240
 
@@ -62,7 +62,7 @@ def of_checks(checks: Mapping[str, Mapping[str, Any]]) -> Look | None:
     return None
 
 
-def joined(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted: str) -> Diagnosed | None:
+def joined_looks(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted: str) -> Diagnosed | None:
     """The result of an axis by two looks, of which each may be missing: neither overrules the other.
 
     Every sample has the causes, if that look ended or has any. Where it shows none, the means of 1 s have them, at the

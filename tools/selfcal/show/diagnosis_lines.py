@@ -16,10 +16,10 @@ from selfcal.base import units
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
-from selfcal.show.identification import heading
+from selfcal.show.identification import recording_heading
 
 #: Width of a line without a terminal, characters.
-WIDTH = 114
+LINE_CHARACTERS = 114
 
 
 def show(
@@ -29,10 +29,10 @@ def show(
     if console is None:
         console = console_of(to_stderr=to_stderr)
         if not console.is_terminal:  # its cells wrap and lose nothing
-            console.width = WIDTH
+            console.width = LINE_CHARACTERS
 
     say = partial(print_line, console)
-    say(heading(document["recording"]))
+    say(recording_heading(document["recording"]))
     shown, less = parted(document["findings"])
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     if shown:

@@ -29,7 +29,7 @@ DATE_FORM = "2026-03-01 or 2026-03-01T14:30:00Z (ISO 8601)"
 
 
 @dataclass(frozen=True)
-class Source:
+class BatchSource:
     """A recording of the batch.
 
     `path` as the pattern has it. `sha256` of the file, `content` of the file and the metadata next to it. `device`: ""
@@ -107,27 +107,27 @@ def digest(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def hashed(path: str) -> Source:
+def hashed(path: str) -> BatchSource:
     """A recording with its hashes. One that cannot be read has none; its reading says why."""
     log = Path(path)
     try:
         of_file = digest(log)
         beside = meta_place(log)
         content = of_file if not beside.is_file() else hashlib.sha256((of_file + digest(beside)).encode()).hexdigest()
-        return Source(path, of_file, content, bytes_of(log))
+        return BatchSource(path, of_file, content, bytes_of(log))
     except OSError:
-        return Source(path, content=f"unread {path}")
+        return BatchSource(path, content=f"unread {path}")
 
 
 @dataclass(frozen=True)
 class Named:
     """The sources, and the names that were left out because another name has the same content."""
 
-    sources: list[Source]
+    sources: list[BatchSource]
     copies: dict[str, str]
 
 
-def sources_of(
+def batch_sources(
     patterns: Sequence[str], table: Path | str | None, serial_from: str | None, own: Sequence[Path] = ()
 ) -> Named:
     """The recordings of the patterns but the outputs `own`, with device, station, lot and date by the table of units.
@@ -139,8 +139,8 @@ def sources_of(
     """
     named = _serials(matching(patterns, own), serial_from)
     units = {} if table is None else _table(Path(table), list(named))
-    sources: list[Source] = []
-    first: dict[str, Source] = {}
+    sources: list[BatchSource] = []
+    first: dict[str, BatchSource] = {}
     copies: dict[str, str] = {}
     for path, device in named.items():
         fields: dict[str, Any] = {"device": device, **units.get(path, {})}

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import chdtrc
 
+from selfcal.base.grid import Array
 from selfcal.base.units import power
 from selfcal.diagnosis import curve
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, medians, positive, shown
@@ -25,8 +26,7 @@ from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_EITHER, LN_SLOW, Number, Shape, Tried
 from selfcal.likelihood.fit import left
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, Regressor, State, ln_looks
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.state import ALIKE, NET_LEAST, FittedColumn, Look, State, ln_looks
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.forms import NUMBER, POWER, curved, formed, slope
 from selfcal.model.regressors import coefficient_unit
@@ -143,12 +143,12 @@ def shape_of(channel: Channel, state: State, form: str, number: float, width_s: 
     entry |= {"reference": channel.reference}
     smooth = {"window_s": width_s} if window > 1 else {}
 
-    def regressor(form: str, values: Array, **more: Any) -> Regressor:
+    def regressor(form: str, values: Array, **more: Any) -> FittedColumn:
         name = channel.name if form == "static" else f"{channel.name}_{form}"
         unit = "1" if form == FREE else power(channel.of, POWER.get(form, 1)) + ("/s" if form == "rate" else "")
         stated = {"form": form} if form != "static" else {}
         own = {key: value for key, value in entry.items() if form not in ("rate", FREE) or key != "reference"}
-        return Regressor(name, channel.cause, values, unit, {**own, **smooth, **stated, **more})
+        return FittedColumn(name, channel.cause, values, unit, {**own, **smooth, **stated, **more})
 
     if form == FREE:
         means = smoothed(channel.values, window)
@@ -197,7 +197,7 @@ def _span(channel: Channel) -> float:
     return float(np.ptp(channel.values))
 
 
-def form_of(column: Regressor) -> tuple[str, str, str]:
+def form_of(column: FittedColumn) -> tuple[str, str, str]:
     """Channel, input and form of a column in a model; no channel for one of time alone."""
     entry = column.entry
     form = "rate" if entry.get("kind") == "rate" else str(entry.get("form", "static"))
@@ -425,7 +425,7 @@ def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
     return total
 
 
-def of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+def of_column(column: FittedColumn, c: Sequence[float]) -> dict[str, Any]:
     """Keys of `simulate --effect` for one column of a form."""
     form = form_of(column)[2]
     if form in ("rate", "square", "cube"):
@@ -436,7 +436,7 @@ def of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
     return {"coefficient": c[0], **({NUMBER[form]: float(column.entry[NUMBER[form]])} if form in NUMBER else {})}
 
 
-def of_other(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
+def of_other(column: FittedColumn, c: Sequence[float]) -> dict[str, Any]:
     """The same of another axis."""
     return {**of_column(column, c), "other": str(column.entry["column"])}
 

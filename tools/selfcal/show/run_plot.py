@@ -8,20 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from selfcal.bank.result import FAINT
+from selfcal.bank.axis_result import LAW_LEAST
 from selfcal.base.errors import printable
-from selfcal.base.output import plotter, save_picture
+from selfcal.base.grid import Array
 from selfcal.base.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.model.file import LARGEST
+from selfcal.show.plots import COLORS, plotter, save_picture
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import AxisReport, axis_unit
 
-#: Colours of the hypotheses, in the model's order.
-COLORS = ("tab:green", "tab:blue", "tab:red", "tab:purple", "tab:orange", "tab:olive", "tab:brown", "tab:cyan")
 #: Share of first reports that set no scale: their intervals are the prior's.
-SETTLING = 0.2
+UNSCALED_SHARE = 0.2
 
 
 def plot_run(
@@ -103,12 +101,12 @@ def plot_run(
 
 
 def _opacity(probability: float) -> float:
-    return 1.0 if probability >= FAINT else 0.2
+    return 1.0 if probability >= LAW_LEAST else 0.2
 
 
 def _draw(
     panel: Any,
-    time: NDArray[np.float64],
+    time: Array,
     reports: Sequence[AxisReport],
     parameter: str,
     candidates: Mapping[int, str],
@@ -118,7 +116,7 @@ def _draw(
     """Draw a parameter's median and interval for each law that came; what the panel's scale has to hold. `last`: the
     probabilities at the end."""
     span: list[float] = []
-    late, best = int(SETTLING * len(time)), -1
+    late, best = int(UNSCALED_SHARE * len(time)), -1
     for k, place in ((k, place) for k, place in candidates.items() if k in last):
         signals = (f"h{k}_{place}_{key}" for key in ("q05", "median", "q95"))
         low, middle, high = (_values(reports, signal) * scale for signal in signals)
@@ -127,7 +125,7 @@ def _draw(
         opacity = _opacity(last[k])
         panel.fill_between(time, low, high, color=COLORS[k], alpha=0.25 * opacity, linewidth=0)
         panel.plot(time, middle, color=COLORS[k], alpha=opacity)
-        if last[k] >= FAINT and math.isfinite(middle[-1]):
+        if last[k] >= LAW_LEAST and math.isfinite(middle[-1]):
             span += [*low[late:], *high[late:]]
             if last[k] > last.get(best, 0.0):
                 best = k
@@ -152,7 +150,7 @@ def _scales(parameter: str) -> bool:
     return parameter_unit(parameter, "deg/s") not in ("1", "1/s", "")
 
 
-def _values(reports: Sequence[AxisReport], signal: str) -> NDArray[np.float64]:
+def _values(reports: Sequence[AxisReport], signal: str) -> Array:
     return np.array([report.value(signal) for report in reports])
 
 

@@ -10,15 +10,15 @@ import math
 
 import numpy as np
 
-from selfcal.base.grid import weighted_quantiles
+from selfcal.base.grid import Array, weighted_quantiles
 from selfcal.model.file import Prior
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, probabilities
+from selfcal.studies.methods.problem import Answer, Problem, Value, probabilities
 
 #: Nodes of the ratio and of alpha, and of the white noise within its likelihood's width.
 MARKOV, NOISE = (110, 40), 41
 #: Width of the grid of white noise, in standard deviations of ln sigma_v.
-REACH = 7.0
+WHITE_REACH = 7.0
 
 
 def grid(problem: Problem) -> Answer:
@@ -39,7 +39,7 @@ def grid(problem: Problem) -> Answer:
     return Answer(estimates, probabilities(ln_evidence))
 
 
-def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
+def nodes(problem: Problem, law: str) -> tuple[Array, Array]:
     """ln parameters [d, m] and ln of likelihood times prior mass [m]."""
     dt, priors = problem.dt_s, problem.group.priors
     noise = ln_limits(priors["N"])
@@ -61,14 +61,14 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
     A, B, C, D = _sums(problem.y - problem.y[0], phi, step, start)
     n, origin = problem.y.size, float(problem.y[0])
     mode = 0.5 * np.log((C - B**2 / A) / n)
-    ln_sigma = mode[:, None] + np.linspace(-REACH, REACH, NOISE) / math.sqrt(2.0 * n)
+    ln_sigma = mode[:, None] + np.linspace(-WHITE_REACH, WHITE_REACH, NOISE) / math.sqrt(2.0 * n)
     variance, P0 = np.exp(2.0 * ln_sigma), priors["bias"].sd ** 2
     a = A[:, None] / variance + 1.0 / P0
     b = B[:, None] / variance - origin / P0  # the prior's mean is 0, that is -origin in these readings
     value = -n * ln_sigma - 0.5 * D[:, None] - 0.5 * (C[:, None] / variance + origin**2 / P0 - b**2 / a)
     value -= 0.5 * np.log(a * P0)
     ln_N = ln_sigma + 0.5 * math.log(dt)
-    value += ln_density(priors["N"], ln_N) + math.log(2.0 * REACH / math.sqrt(2.0 * n) / (NOISE - 1))
+    value += ln_density(priors["N"], ln_N) + math.log(2.0 * WHITE_REACH / math.sqrt(2.0 * n) / (NOISE - 1))
     rows = [ln_N]
     if law != "constant":
         ln_drift = ln_N + np.repeat(ln_ratio, ln_alpha.size)[:, None]
@@ -81,7 +81,7 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
     return np.array([row[keep] for row in rows]), value[keep]
 
 
-def _sums(y: Floats, phi: Floats, step: Floats, start: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+def _sums(y: Array, phi: Array, step: Array, start: Array) -> tuple[Array, Array, Array, Array]:
     """Sums of u^2 / s, u v / s, v^2 / s and ln s [m] over the innovations v of the readings and u of a constant 1, by
     one Kalman filter a node with white noise of variance 1."""
     p, x, w = start.copy(), np.zeros_like(phi), np.zeros_like(phi)
@@ -106,7 +106,7 @@ def ln_limits(prior: Prior) -> tuple[float, float]:
     return math.log(prior.min), math.log(prior.max)
 
 
-def ln_density(prior: Prior, ln_value: Floats) -> Floats:
+def ln_density(prior: Prior, ln_value: Array) -> Array:
     """ln of the prior density in the parameter's logarithm, -inf outside."""
     low, high = ln_limits(prior)
     inside = (ln_value >= low - 1e-9) & (ln_value <= high + 1e-9)

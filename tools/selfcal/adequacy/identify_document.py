@@ -12,9 +12,9 @@ from typing import Any
 
 from selfcal.adequacy.allan import Sampled
 from selfcal.adequacy.checks import Judged, against, allan_limit
-from selfcal.adequacy.summary import Number
-from selfcal.bank.result import AxisResult, Estimate
-from selfcal.bank.subsets import Scored
+from selfcal.adequacy.summary import SheetNumber
+from selfcal.bank.axis_result import AxisResult, Estimate
+from selfcal.bank.subsets import ScoredSubsets
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, short
 from selfcal.base.output import write_json
@@ -39,9 +39,9 @@ class Identified:
     result: AxisResult
     judged: Judged
     kept_out: Mapping[str, int]
-    scored: Scored | None = None
+    scored: ScoredSubsets | None = None
     sampled: Sampled | None = None
-    summary: Mapping[str, Number] = field(default_factory=dict)
+    summary: Mapping[str, SheetNumber] = field(default_factory=dict)
     halved_after: Mapping[str, float | None] = field(default_factory=dict)
     more_laws: Mapping[str, float] = field(default_factory=dict)
 
@@ -90,7 +90,7 @@ def as_typed(recording: Mapping[str, Any]) -> str:
     return printable(shlex.join([*recording.get("paths", [recording["path"]]), *options]))
 
 
-def to_document(
+def identify_document(
     recording: Recording | Mapping[str, Any],
     axes: Mapping[str, Identified | UserError],
     *,
@@ -203,7 +203,7 @@ def _allan(axis: Identified) -> dict[str, Any] | None:
     return entry
 
 
-def regressors_entry(scored: Scored | None) -> dict[str, Any]:
+def regressors_entry(scored: ScoredSubsets | None) -> dict[str, Any]:
     """The keys an axis has beyond the contract's if its model has regressors."""
     if scored is None:
         return {}

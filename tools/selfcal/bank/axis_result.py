@@ -8,17 +8,14 @@ from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from selfcal.base import units
-from selfcal.base.grid import bisected
+from selfcal.base.grid import Array, bisected
 from selfcal.model.laws import RATIOS
 
 #: Standard deviations from the middle of a normal to either end of its 90 % interval.
 HALF_90 = NormalDist().inv_cdf(0.95)
 #: Least probability of a law that a table, a picture or a prior takes into account.
-FAINT = 0.01
+LAW_LEAST = 0.01
 
 
 def likeliest(probability: Mapping[str, float]) -> str:
@@ -38,9 +35,7 @@ def sd_of(estimate: Mapping[str, Any]) -> float:
     return float((estimate["q95"] - estimate["q05"]) / (2.0 * HALF_90))
 
 
-def of_mixture(
-    weight: NDArray[np.float64], mean: NDArray[np.float64], sd: NDArray[np.float64]
-) -> tuple[float, float, float, float, float]:
+def of_mixture(weight: Array, mean: Array, sd: Array) -> tuple[float, float, float, float, float]:
     """Mean, sd, and quantiles 0.05, 0.5 and 0.95 of a sum of normals [m], `weight` of each not normalized."""
     from scipy.special import ndtr  # a tenth of a second to import, for a mixture only
 

@@ -124,12 +124,7 @@ class Header:
         return {key: name for name, wanted in self.columns.items() for key in _called(keys, wanted)}
 
     def fields(
-        self,
-        keys: Sequence[str],
-        where: str,
-        described: Any,
-        cells: Mapping[str, str],
-        meant: Mapping[str, Meaning],
+        self, keys: Sequence[str], where: str, described: Any, cells: Mapping[str, str], meant: Mapping[str, Meaning]
     ) -> list[Field]:
         """One field for each column to read, in file order. `where` is put after the path in messages; `described` is
         what a meta text says of columns that are named plainly; `cells`: those of the first row of a text, by heading;

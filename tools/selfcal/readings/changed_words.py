@@ -15,20 +15,20 @@ from scipy.ndimage import uniform_filter1d
 
 from selfcal.base.grid import MEDIAN_SD, Array, noise_of
 from selfcal.readings.budget import nats_of
-from selfcal.readings.codes import CHANGED_LEAST, PIECE, PIECES, Misread, codes_of
+from selfcal.readings.codes import CHANGED_LEAST, LEVEL_PIECES, PIECE_ROWS, Misread, codes_of
 from selfcal.readings.lattice import Lattice, step_of
 
 #: Share of the readings that a span has changed, or of the codes with a bit, that may be one value, or are there.
-ALIKE = 0.9
+SPAN_SHARE_MOST = 0.9
 #: Deviations, in noises, from which on a reading is none of the noise. Of the torn ones, how many more lie on one side,
 #: in standard deviations.
-FAR, EITHER_SIDE = 6.0, 4.0
+FAR_NOISES, EITHER_SIDE = 6.0, 4.0
 #: Quantiles of the codes of which most have the bit that is there.
 INNER = (0.01, 0.99)
 #: Bits at least of a count that goes round.
 BITS_LEAST = 5
 #: Noises of a reading in the circle of a count from which on each has its turn; with half of them a torn one shows.
-WHOLE = 8.0
+CIRCLE_NOISES = 8.0
 #: What may have happened, by kind.
 MISREAD = MappingProxyType(
     {
@@ -53,19 +53,19 @@ def spans_of(values: Array) -> Misread | None:
     the least step of its upper part, to either side as often. On a lattice spans are its powers of two."""
     known = np.flatnonzero(np.isfinite(values))
     y = values[known]
-    if y.size < PIECE or not np.ptp(y) > 0.0:
+    if y.size < PIECE_ROWS or not np.ptp(y) > 0.0:
         return None
     step, size = step_of(y)[0], float(np.ptp(y))
     jump = float(np.partition(np.abs(np.diff(y)), -CHANGED_LEAST)[-CHANGED_LEAST])
     spans, ends = [], size + float(np.diff(np.unique(y)).min())
     if step > 0.0:
         whole = step * 2.0 ** math.ceil(math.log2(size / step + 0.5))
-        least = max(step * 2.0**BITS_LEAST, 0.5 * WHOLE * noise_of(y))
+        least = max(step * 2.0**BITS_LEAST, 0.5 * CIRCLE_NOISES * noise_of(y))
         spans = [whole, *(span for span in whole * 0.5 ** np.arange(1, 64) if span > least)]
     spans = [span for span in (*spans, ends) if 2.0 * jump > span >= step * 2.0**BITS_LEAST]
     if not spans:
         return None
-    line = _ln_of_noise(y - uniform_filter1d(y, PIECE, mode="nearest"), size)
+    line = _ln_of_noise(y - uniform_filter1d(y, PIECE_ROWS, mode="nearest"), size)
     tried = [_of_span(y, span, line, span < size, k < len(spans) - 1) for k, span in enumerate(spans)]
     best = max(filter(None, tried), key=lambda misread: misread.nats, default=None)
     if best is None or best.nats < nats_of("misread") + math.log(len(spans)):
@@ -84,7 +84,7 @@ def _ln_of_noise(off: Array, size: float) -> float:
         variance = max(float(np.mean(some**2)), 1e-12 * size**2)
         return -0.5 * some.size * math.log(2.0 * math.pi * math.e * variance)
 
-    core = np.abs(off) < FAR * float(np.median(np.abs(off))) / MEDIAN_SD
+    core = np.abs(off) < FAR_NOISES * float(np.median(np.abs(off))) / MEDIAN_SD
     share = 1.0 - float(core.mean())
     if not 0.0 < share < 1.0:
         return normal(off)
@@ -96,7 +96,7 @@ def _of_span(y: Array, span: float, line: float, torn: bool, lattice: bool) -> M
     """The evidence that readings [n] are off by `span`, once if `torn`, else any number of times. `line`: ln likelihood
     about a level that follows them as they are. A span that no `lattice` states is known of little noise alone."""
     turn = 2.0 * math.pi / span
-    level = np.unwrap(np.angle(uniform_filter1d(np.exp(1j * turn * y), PIECE, mode="nearest"))) / turn
+    level = np.unwrap(np.angle(uniform_filter1d(np.exp(1j * turn * y), PIECE_ROWS, mode="nearest"))) / turn
     turns = np.rint((level - y) / span)
     own = float(np.median(turns))
     turns -= own
@@ -105,7 +105,7 @@ def _of_span(y: Array, span: float, line: float, torn: bool, lattice: bool) -> M
         turns = np.clip(turns, -1.0, 1.0)
     changed, off = turns != 0.0, straight + span * turns
     count, size, sd = int(np.count_nonzero(changed)), float(np.ptp(y)), float(off.std())
-    if count < CHANGED_LEAST or np.unique(y[changed], return_counts=True)[1].max() > ALIKE * count:
+    if count < CHANGED_LEAST or np.unique(y[changed], return_counts=True)[1].max() > SPAN_SHARE_MOST * count:
         return None  # one value is a lost word
     share = count / y.size
     nats = _ln_of_noise(off, size) - max(line, _ln_of_noise(straight, size))
@@ -113,17 +113,17 @@ def _of_span(y: Array, span: float, line: float, torn: bool, lattice: bool) -> M
         if abs(float(turns.sum())) > EITHER_SIDE * math.sqrt(count):
             return None
         nats += count * math.log(0.5 * share) + (y.size - count) * math.log1p(-share)
-        return Misread("torn", share, nats, y + span * turns if sd * WHOLE < span else None)
-    if span < 2.0 * WHOLE * sd and not lattice:
+        return Misread("torn", share, nats, y + span * turns if sd * CIRCLE_NOISES < span else None)
+    if span < 2.0 * CIRCLE_NOISES * sd and not lattice:
         return None
     steps = np.diff(y)  # two levels that lie far apart are no neighbours on the circle either
     nats = min(nats, _ln_of_noise(steps - span * np.rint(steps / span), size) - _ln_of_noise(steps, size))
     kind = "overflow" if float(y.min()) < 0.0 else "low_bits"
     middle = float(np.median(y + span * turns))
     # The true ones are about zero, of a wide count by more of their noises.
-    if kind == "low_bits" and min(middle, span - middle) < max(sd, span / WHOLE**2):
+    if kind == "low_bits" and min(middle, span - middle) < max(sd, span / CIRCLE_NOISES**2):
         kind, turns = "unsigned", turns - float(np.rint(middle / span))
-    return Misread(kind, float(np.mean(turns != 0.0)), nats, y + span * turns if sd * WHOLE < span else None)
+    return Misread(kind, float(np.mean(turns != 0.0)), nats, y + span * turns if sd * CIRCLE_NOISES < span else None)
 
 
 def _of_bits(values: Array, lattice: Lattice | None) -> list[Misread]:
@@ -132,7 +132,7 @@ def _of_bits(values: Array, lattice: Lattice | None) -> list[Misread]:
 
     Each time that the bits above it change, the bit itself is one or the other by chance."""
     y = values[np.isfinite(values)]
-    if lattice is None or y.size < PIECES:
+    if lattice is None or y.size < LEVEL_PIECES:
         return []
     code = np.rint(y / lattice.step).astype(np.int64)
     low, high = (int(edge) for edge in np.quantile(code, INNER))
@@ -145,7 +145,7 @@ def _of_bits(values: Array, lattice: Lattice | None) -> list[Misread]:
             maps.append(Misread("range_change", size / y.size, nats))
         inner = np.arange(low, high + 1)
         inner = inner[((inner >> k) & 1) == bit[0]]
-        if k and bit.min() == bit.max() and np.isin(inner, code).mean() > ALIKE:
+        if k and bit.min() == bit.max() and np.isin(inner, code).mean() > SPAN_SHARE_MOST:
             nats = math.log(2.0) * np.count_nonzero(np.diff(code >> (k + 1))) - math.log(64.0)
             maps.append(Misread(f"bit_{'set' if bit[0] else 'clear'}", 0.5, nats))
     return [misread for misread in maps if misread.nats > nats_of("misread")]

@@ -1,5 +1,4 @@
-"""The tests of the readings, in one table: `identify`, `diagnose`, `fleet`, `compare`, `replay` and `convert` name what
-these name."""
+"""Faults of the readings in one table. `identify`, `diagnose`, `fleet`, `compare`, `replay` and `convert` name them."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ from selfcal.readings.readings import Clipped, Readings
 
 
 @dataclass(frozen=True)
-class Test:
+class Fault:
     """`name`: of a check and of a cause. `statistic`: the evidence of readings in nats, 0 where they are sound. `mask`:
     which share of them it is about, or which rows [n]."""
 
@@ -43,13 +42,13 @@ def _held(readings: Readings) -> float:
     return always + sum(stretch.nats for stretch in readings.slower)
 
 
-#: Every test, the causes that spoil the others first. Their shares of chance: budget.py.
-TESTS = (
-    Test("misread", lambda r: _nats(r.misread), lambda r: _share(r.misread)),
-    Test("quantization", lambda r: _nats(r.uneven), lambda r: _share(r.uneven)),
-    Test("saturation", lambda r: _nats(r.clipped), lambda r: 0.0 if r.clipped is None else r.clipped.mask),
-    Test("outliers", lambda r: _nats(r.recurring), lambda r: _share(r.recurring)),
-    Test("stuck", lambda r: r.stuck_nats, lambda r: r.stuck),
-    Test("held_samples", _held, _repeats),
-    Test("motion", lambda r: 0.0 if r.moved is None else r.moved.net, lambda r: r.moving),
+#: Every fault, the causes that spoil the others first. Their shares of chance: budget.py.
+FAULTS = (
+    Fault("misread", lambda r: _nats(r.misread), lambda r: _share(r.misread)),
+    Fault("quantization", lambda r: _nats(r.uneven), lambda r: _share(r.uneven)),
+    Fault("saturation", lambda r: _nats(r.clipped), lambda r: 0.0 if r.clipped is None else r.clipped.mask),
+    Fault("outliers", lambda r: _nats(r.recurring), lambda r: _share(r.recurring)),
+    Fault("stuck", lambda r: r.stuck_nats, lambda r: r.stuck),
+    Fault("held_samples", _held, _repeats),
+    Fault("motion", lambda r: 0.0 if r.moved is None else r.moved.net, lambda r: r.moving),
 )

@@ -27,21 +27,21 @@ from selfcal.readings.budget import CLEARLY, SHARES
 Time = TypeVar("Time", int, float)
 
 #: Length of a piece, s, and pieces at most.
-PIECE_S, PIECES_MOST = 0.1, 40_000
+ENERGY_PIECE_S, PIECES_MOST = 0.1, 40_000
 #: Lengths of the means whose energy is taken beside the readings', s: a knock is short, and a hand that turns slowly
 #: shows in long ones alone. Pushes are looked for in the shortest ones. Readings in one at least.
 BANDS_S, BAND_LEAST = (0.1, 0.5), 5
 #: Standard deviations of the median about a wild reading at most, and of itself at least.
-WILD = (3.0, 8.0)
+WILD_SDS = (3.0, 8.0)
 #: Readings whose median is the level of the middle one: ramps, jumps and slow waves have no part in what is apart from
 #: it. Squares of white noise about it in one degree of freedom.
 LEVEL, SQUARES = 9, 1.29
 #: Longest window, s. Its sides are so many times as long each, PUSH_S at least, and squares at least.
-WINDOW_S, SIDE, SIDE_SQUARES = 32.0, 8, 120
+WINDOW_S, SIDE_WINDOWS, SIDE_SQUARES = 32.0, 8, 120
 #: Probability, a record, that axes at rest move together, and that one moves alone.
-SHARE = SHARES["motion"]
+P_MOVE = SHARES["motion"]
 #: Share of an axis' windows that are its usual loudness. The rest is the most that may be loud on one axis alone.
-OWN = 0.9
+USUAL_SHARE = 0.9
 #: Quantiles of the means of windows that show their spread without the loud ones: the median, and one sd below it.
 QUIETER = (0.1587, 0.5)
 #: Discount, nats, of the joint search over windows against independent windows: of 124 clean records of 600 and 1500 s
@@ -121,8 +121,10 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
         for stretch in stretches(energy):
             for k in np.flatnonzero(stretch.axes).tolist():
                 of_axis[names[k]].append(stretch)
-        times = {name: joined([_times(energy, stretch, recording) for stretch in of_axis[name]]) for name in names}
-        events = events_of(times).values()
+        times = {
+            name: joined_intervals([_times(energy, stretch, recording) for stretch in of_axis[name]]) for name in names
+        }
+        events = motion_events(times).values()
 
         def within(k: int, spans: Sequence[tuple[float, float]]) -> Moved:
             name = names[k]
@@ -173,7 +175,7 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
     """The energy of columns. O(n)."""
     clocks = [recording.clock_of(name) for name in names]
     length_s = max(float(clock.time_s[-1]) + 1.0 / clock.rate_hz for clock in clocks)
-    piece_s = max(PIECE_S, 1.0 / max(clock.rate_hz for clock in clocks), length_s / PIECES_MOST)
+    piece_s = max(ENERGY_PIECE_S, 1.0 / max(clock.rate_hz for clock in clocks), length_s / PIECES_MOST)
     count = math.ceil(length_s / piece_s - 1e-6)
     sums, counts = np.zeros((2, len(names), 2 + len(BANDS_S), count))
     squares = np.zeros((len(names), count))
@@ -244,7 +246,7 @@ def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> li
 def _correlation(rows: Sequence[Array] | Array) -> Array:
     """Correlation of rows [k, n] about 0 and of deviation 1, without wild values [k, k]."""
     tame = np.array(rows, np.float32)  # half of the memory
-    np.clip(tame, -WILD[0], WILD[0], out=tame)
+    np.clip(tame, -WILD_SDS[0], WILD_SDS[0], out=tame)
     tame -= tame.mean(axis=1, keepdims=True)
     products = (tame @ tame.T).astype(np.float64)
     size = np.sqrt(np.diag(products))
@@ -263,7 +265,7 @@ def _tame(y: Array, size: int = LEVEL) -> tuple[Array, float]:
     apart = y - level
     far = np.abs(apart)
     noise = float(np.median(far)) / MEDIAN_SD
-    wild = (far > WILD[1] * noise) & (median_filter(far, BAND_LEAST, mode="nearest") < WILD[0] * noise)
+    wild = (far > WILD_SDS[1] * noise) & (median_filter(far, BAND_LEAST, mode="nearest") < WILD_SDS[0] * noise)
     most = 2.0 * math.log(y.size / (1.0 + float(wild.sum())))
     return level + np.where(wild, np.sign(apart) * math.sqrt(most) * noise, apart), most
 
@@ -297,7 +299,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     for length in lengths:
         begin = np.arange(0, pieces - length + 1, max(1, length // 4))
         nats, inside, wide = _nats(energy, before, begin, length, wide)
-        own = np.quantile(nats, OWN, axis=2, keepdims=True) / math.log(0.5 / (1.0 - OWN))
+        own = np.quantile(nats, USUAL_SHARE, axis=2, keepdims=True) / math.log(0.5 / (1.0 - USUAL_SHARE))
         nats /= np.maximum(1.0, own)
         nats, others = nats[:-1], nats[-1]
         loudest = nats.max(axis=1)
@@ -311,13 +313,13 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
                     loud.append((float(net[window]), int(begin[window]), length, which))
     taken = np.zeros(pieces, bool)
     apart: list[Stretch] = []
-    sure = -math.log(SHARE)  # a stretch that is sure by itself says nothing of others, and no other takes its place
+    sure = -math.log(P_MOVE)  # a stretch that is sure by itself says nothing of others, and no other takes its place
     for net, first, length, which in sorted(loud, key=lambda entry: (entry[0] <= sure, entry[3].sum() == 1, -entry[0])):
         if not taken[first : first + length].any():
             a, b = _ends(energy, *_ends(energy, first, first + length, which), which)
             nats = _nats(energy, before, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
             of_others = np.count_nonzero(which) == 1
-            more = _sharing(energy, a, b, which) & (nats > (-math.log(SHARE) if of_others else CLEARLY))
+            more = _sharing(energy, a, b, which) & (nats > (-math.log(P_MOVE) if of_others else CLEARLY))
             which = which | more if of_others else more  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
             taken[a:b] = True
@@ -328,7 +330,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         # At rest exp(-net) stretches are beyond a net: the fewest that are together no chance. Those of one axis depend
         # on each other, as its noise is not normal: for them by Simes' bound.
         chances = (gammainc(k, math.exp(-net)) if several else math.exp(-net) / k for k, net in enumerate(nets, 1))
-        least[several] = max((net for net, chance in zip(nets, chances, strict=True) if chance < SHARE), default=sure)
+        least[several] = max((net for net, chance in zip(nets, chances, strict=True) if chance < P_MOVE), default=sure)
     return [each for each in apart if each.net >= least[each.several]]
 
 
@@ -338,7 +340,7 @@ def _nats(energy: Energy, before: Sequence[Array], begin: Rows, length: int, wid
     the means lie, `wide` at least [axes, bands]. `before`: of the energy."""
     axes, bands, pieces = energy.sums.shape
     most = max(1e-9, float(energy.counts.sum(axis=2).max()) / pieces)
-    side = max(SIDE * length, round(PUSH_S / energy.piece_s), math.ceil(SIDE_SQUARES / most))
+    side = max(SIDE_WINDOWS * length, round(PUSH_S / energy.piece_s), math.ceil(SIDE_SQUARES / most))
     nats, wide = np.zeros((axes + 1, bands, begin.size)), wide.copy()
     inside = np.zeros((axes, begin.size), bool)
     for band in range(bands):  # one by one: a long record has many windows
@@ -358,7 +360,7 @@ def _of_band(
         difference: Array = every[:, np.clip(last, 0, pieces)] - every[:, np.clip(first, 0, pieces)]
         return difference
 
-    least = counts[:, -1:] / pieces * side / SIDE
+    least = counts[:, -1:] / pieces * side / SIDE_WINDOWS
     level, beside = np.zeros((2, len(sums), begin.size))
     both = np.ones(level.shape, bool)
     for first in (begin - 1 - side, begin + length + 1):
@@ -443,7 +445,7 @@ def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:
     reach = []
     for part in (gain[middle:], gain[middle::-1]):
         sums = np.cumsum(part)
-        over = np.flatnonzero(sums < np.maximum.accumulate(sums) + math.log(SHARE))
+        over = np.flatnonzero(sums < np.maximum.accumulate(sums) + math.log(P_MOVE))
         reach.append(int(np.argmax(sums[: over[0] if over.size else sums.size])))
     return middle - reach[1], middle + reach[0] + 1
 
@@ -461,23 +463,23 @@ def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
     linked = np.abs(together) > SHARED + CORRELATED / math.sqrt(values.shape[1])
     linked = np.linalg.matrix_power(linked.astype(float), axes.size) > 0.0  # by others too
     loudest = np.max([stretch.nats[axes] for stretch in moved], axis=0)
-    sure = loudest >= min(-math.log(SHARE), float(loudest.max()))
+    sure = loudest >= min(-math.log(P_MOVE), float(loudest.max()))
     if not linked[np.ix_(sure, sure)].all() or (linked.sum(axis=1)[sure] == 1).any():
         return False
     size, vectors = np.linalg.eigh(together)
     loud_ones = vectors / np.sqrt(np.maximum(size, TINY)) @ vectors.T @ values[:, inside]
     mean = np.maximum(np.linalg.eigvalsh(loud_ones @ loud_ones.T) / np.count_nonzero(inside), 1.0)
     nats = 0.5 * np.count_nonzero(inside) / SQUARES * (mean - 1.0 - np.log(mean))
-    return float(nats[:-1].sum()) < -math.log(SHARE)
+    return float(nats[:-1].sum()) < -math.log(P_MOVE)
 
 
-def events_of(
+def motion_events(
     intervals: Mapping[str, Sequence[tuple[float, float]]],
 ) -> dict[tuple[str, ...], list[tuple[float, float]]]:
     """Events by their axes, of the intervals of each axis: those that meet are one, and those of the same axes are one
     again."""
     events: dict[tuple[str, ...], list[tuple[float, float]]] = {}
-    for each in joined([each for own in intervals.values() for each in own]):
+    for each in joined_intervals([each for own in intervals.values() for each in own]):
         names = tuple(name for name, own in intervals.items() if _overlap(own, *each))
         events.setdefault(names, []).append(each)
     return events
@@ -487,7 +489,7 @@ def _overlap(intervals: Sequence[tuple[float, float]], begin: float, end: float)
     return any(a <= end and begin <= b for a, b in intervals)
 
 
-def joined(intervals: Sequence[tuple[Time, Time]]) -> list[tuple[Time, Time]]:
+def joined_intervals(intervals: Sequence[tuple[Time, Time]]) -> list[tuple[Time, Time]]:
     """In order of time, those that touch made one."""
     spans: list[tuple[Time, Time]] = []
     for a, b in sorted(intervals):

@@ -9,7 +9,7 @@ from copy import deepcopy
 from types import MappingProxyType
 from typing import Any
 
-from selfcal.adequacy.document import recording_entry
+from selfcal.adequacy.identify_document import recording_entry
 from selfcal.base import units as unit_module
 from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError
@@ -29,7 +29,7 @@ SCHEMA = "selfcal.diagnose/1"
 G_SENSITIVITY_UNIT = coefficient_unit("deg/s", "m/s^2")
 
 
-def to_document(
+def diagnose_document(
     recording: Recording,
     found: Mapping[str, Diagnosed],
     errors: Mapping[str, str],
