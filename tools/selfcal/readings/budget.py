@@ -33,7 +33,7 @@ SHARES: Mapping[str, float] = MappingProxyType(
 OF_MODULES: Mapping[str, float] = MappingProxyType(
     {"looks": 7e-3, "together": 1e-2, "statistics": 8e-4, "coherence": 2e-4}
 )
-#: Of sound batches, units, calibrations and comparisons, by what says that one is not.
+#: Share of sound batches, units, calibrations and comparisons that a test calls unsound.
 FALSE_ALARM = 1e-3
 #: Axes of a module, by which its shares are split.
 AXES = len(SENSORS)

@@ -1,5 +1,5 @@
-"""The tests of the readings, in one table: `identify`, `diagnose`, `fleet`, `compare`, `replay` and `convert` name what
-these name."""
+"""The table of the tests of readings. `identify`, `diagnose`, `fleet`, `compare`, `replay` and `convert` name their
+findings."""
 
 from __future__ import annotations
 
