@@ -45,7 +45,7 @@ _HEAD, _FMT = b"\xa3\x95", 0x80
 
 
 class _Rows:
-    """Values of one source, a column each."""
+    """Values of a source, a column for each heading."""
 
     def __init__(self, headings: list[str]) -> None:
         self.headings, self.values = headings, array("d")
@@ -78,7 +78,7 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _ends(data: Bytes) -> Callable[[int], int]:
-    """Where the message of a DataFlash log at a place ends. A page's rest that was never written counts as one.
+    """Where the message of a DataFlash log at a place ends. A page's rest that was never written counts as a message.
 
     A message is two bytes, its kind, and what the message FMT of its kind says. Source: ArduPilot's LogStructure.h.
     """

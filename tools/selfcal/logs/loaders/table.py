@@ -1,4 +1,4 @@
-"""A table of a file: columns by their headings, of one clock; and the bounds that readers of arrays share."""
+"""A table of a file: columns by their headings, of a clock; and the bounds that readers of arrays share."""
 
 from __future__ import annotations
 
@@ -155,8 +155,7 @@ def of_groups(
     notes: tuple[str, ...] = (),
     damaged: Damaged = SOUND,
 ) -> list[Table]:
-    """A table for the columns of each group and length: the longest has the group's name, others their length beside
-    it."""
+    """A table for the columns of each group and length: the longest has the group's name, others also their length."""
     longest = {group: max(size for of, size in columns if of == group) for group, _ in columns}
     return [
         of_arrays(group if size == longest[group] else f"{group}:{size}", arrays, meta, notes, damaged)
