@@ -51,7 +51,7 @@ ONE_OVER_F = "the drift is 1/f noise"
 
 @dataclass(frozen=True)
 class Number:
-    """One of the numbers. `reason`: why it is not identified, else ""; its 95 % quantile is then an upper limit."""
+    """A number. `reason`: why it is not identified, else ""; its 95 % quantile is then an upper limit."""
 
     estimate: Estimate
     reason: str = ""
@@ -125,7 +125,7 @@ def summarize(
     ):
         why = WIDE
     if why:
-        # Its limit holds if there is a walk, however little a law with one counts.
+        # Its limit holds if there is a walk, however little a law with a walk counts.
         ends = [estimates["K"].q95 for estimates in result.parameters.values() if "K" in estimates]
         most = [end for end in ends if math.isfinite(end)]
         if (w_walk * walk > 0.0).any():
@@ -157,7 +157,7 @@ def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]
     else:
         lowest = [_minimum(terms, m) for terms in fit.drawn(draws)]
         white, (floor, side) = draws["N"], np.array(lowest, dtype=float).T
-    # A Gauss-Markov drift is like a walk. Noise without a memory, or with one of the other sign, has no Q.
+    # A Gauss-Markov drift is like a walk. Noise without a memory, or with a memory of the other sign, has no Q.
     none = np.zeros(white.size)
     walk = draws.get("K", draws.get("sigma_m", none) * np.sqrt(2.0 * draws.get("alpha", none)))
     over = np.maximum(draws.get(COLOURED, none + 1.0) ** -2.0 - 1.0, 0.0)
