@@ -10,7 +10,7 @@ from selfcal.base.ending import Held
 from selfcal.base.errors import UserError, note
 from selfcal.batch.verdicts import PASS, Verdict, code_of, worst
 
-#: Words for any finding that is unexplained or material, for a material one, and for a change between two recordings.
+#: Words: any unexplained or material finding, a material finding, and a change between two recordings.
 INADEQUATE, MATERIAL, CHANGED = "inadequate", "material", "changed"
 
 

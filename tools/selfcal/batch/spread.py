@@ -200,7 +200,7 @@ def _here(
     count: int | None,
     lost: Callable[[Job], list[Row]] | None,
 ) -> Iterator[tuple[int, list[Row]]]:
-    """Each worker is a pool of its own: a dead one leaves the others at their work, and its own job is known."""
+    """Each worker is a pool of its own: a dead worker leaves the others at their work, and its own job is known."""
     queue, deaths = deque(waiting), dict.fromkeys(waiting, 0)
     with ExitStack() as stack:
         slots: dict[int, ProcessPoolExecutor] = {}
