@@ -1,4 +1,4 @@
-"""Which model a module runs: the one whose tables have the `model_id` of its status."""
+"""Which model a module runs: the model whose tables have the `model_id` of its status."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from selfcal.wire.frames import AXES, names_of
 
 
 class KnownModels:
-    """The default model, and that of the file `path`, with the diagnosis `start` that its module was built from. Raises
-    UserError for an invalid model, or the start of another one."""
+    """The default model, and the model of the file `path`, with the diagnosis `start` that its module was built from.
+    Raises UserError for an invalid model, or the start of another model."""
 
     def __init__(self, path: Path | str | None = None, start: Path | str | None = None) -> None:
         if start is not None and path is None:

@@ -392,7 +392,7 @@ def _watch(
     patience_s: float = math.inf,
 ) -> None:
     """Follow the telemetry until the module has finished, or fallen silent. Of `history` retired axes without a report
-    are taken out. `module`: its program, if it has one."""
+    are taken out. `module`: its program, if any."""
     whole: dict[str, bool] = {}  # the axis's last report
     title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
     with View(decoder, link, title, recording.duration_s, names=lambda status: names_of(model)) as view:
@@ -467,7 +467,7 @@ def document_of(
 
 
 def _identified(recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool) -> Identified:
-    """One axis by the firmware's last report. The checks of its law are made here, over the same samples."""
+    """An axis by the firmware's last report. The checks of its law are made here, over the same samples."""
     recording = recording.along(name)
     regressors, group, unit = offered(model, name), model.group_of(name), recording.columns[name].unit
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,))
