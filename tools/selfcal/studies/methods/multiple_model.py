@@ -62,7 +62,7 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
 
 
 def kalman_filter(problem: Problem, law: str, theta: Floats) -> KalmanFilter:
-    """Level and drift at one node."""
+    """Level and drift at a node."""
     kalman = KalmanFilter(dim_x=2, dim_z=1)
     kalman.H = np.ones((1, 2))
     kalman.R = np.array([[theta[0] ** 2 / problem.dt_s]])

@@ -45,7 +45,7 @@ def coefficients(y: Floats, *, pole: bool) -> tuple[float, float, float]:
 
 
 def update(x: Floats, P: Floats, gradient: Floats, error: float, kept: float = 1.0) -> tuple[Floats, Floats]:
-    """One step of recursive least squares: coefficients and covariance after a prediction `error`. `kept`: the weight
-    of all earlier samples."""
+    """A step of recursive least squares: coefficients and covariance after a prediction `error`. `kept`: the weight of
+    all earlier samples."""
     gain = P @ gradient / (kept + float(gradient @ P @ gradient))
     return x + gain * error, (P - np.outer(gain, gradient @ P)) / kept

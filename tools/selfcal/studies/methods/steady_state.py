@@ -1,5 +1,5 @@
 """The Kalman filter's likelihood with the steady-state gain from the first sample on (Ye, Bar-Shalom et al., IEEE
-Sensors J. 24(24), 2024; own derivation). One recursion a parameter value, the scale in closed form."""
+Sensors J. 24(24), 2024; own derivation). A recursion for each parameter value, the scale in closed form."""
 
 from __future__ import annotations
 
