@@ -153,7 +153,7 @@ def _distance(estimate: Estimate, prior: Prior) -> float:
 def with_readings(
     judged: Judged, readings: Readings, group: Group, unit: str, dt_s: float, *, as_fed: bool = False
 ) -> Judged:
-    """The same with the checks of the readings. `unit`: the recording's. `dt_s`: the bank's interval.
+    """`judged` with the checks of the readings. `unit`: the recording's. `dt_s`: the bank's interval.
 
     `lattice`, if they have a lattice: is their noise above it, or carried on to the next reading? `value`: steps in the
     noise of a reading; `step` in the recording's unit; `distinct` readings; of a counter that fails `counter_hz`: the

@@ -69,8 +69,8 @@ def beside_its_law(parameters: Mapping[str, float], dt_s: float, block: int) -> 
 
 
 def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> AxisResult:
-    """The same with N of the law `flicker` next to 1/f noise. The result is unchanged without that law, or where the
-    record is too short for it."""
+    """The `result` with N of the law `flicker` next to 1/f noise. The result is unchanged without that law, or where
+    the record is too short for it."""
     estimates = result.parameters.get(FLICKER, {})
     medians = {name: estimate.median for name, estimate in estimates.items()}
     if not estimates or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):

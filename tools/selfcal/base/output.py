@@ -52,7 +52,7 @@ def whole(path: Path | str) -> Iterator[Path]:
 
 @contextmanager
 def together(path: Path | str, *others: Path | str) -> Iterator[tuple[Path, ...]]:
-    """The same for files that belong together: all are on the disk before the first takes its place.
+    """Like `whole`, for files that belong together: all are on the disk before the first takes its place.
 
     Older files of `others` are removed first, so that none is left of another `path`. If the block removes a temporary
     file, its target is removed too.

@@ -43,7 +43,7 @@ def outcome(document: Mapping[str, Any], wanted: str) -> Outcome:
 
 
 def _judged(document: Mapping[str, Any], wanted: str) -> Iterator[tuple[bool, str]]:
-    """Of each axis whether it applies, and if not, why that is not known ("": it is)."""
+    """For each axis, whether `wanted` applies, and why that is not known ("": it is)."""
     if "verdicts" in document:
         for name, axis in document["axes"].items():
             apart = isinstance(axis, Mapping)  # not all recordings could be compared

@@ -363,7 +363,7 @@ def steady(curve: Sequence[Mapping[str, float]]) -> float | None:
 
 
 def _swings(wish: Mapping[str, Any]) -> str:
-    """By how much to change the channel: once, or to and fro."""
+    """How much to change the channel: once, or to and fro."""
     once, _, often = wish["cycling"]
     if once["swing"] == 0.0:
         return f"the prior has it: {wish['channel']} may stay as it is"

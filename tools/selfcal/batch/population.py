@@ -148,7 +148,7 @@ class Apart:
     against: str | None = None
 
     def shift(self, devices: NDArray[np.intp]) -> Array:
-        """By how much the units at the places `devices` [n] are off for it."""
+        """Offset of the units at the places `devices` [n] by this group."""
         inside = np.isin(devices, self.members)
         return self.offset * (inside.astype(np.float64) - (0.0 if self.against is None else 0.5))
 
@@ -376,7 +376,7 @@ def _by_medians(y: Array, s: Array, inside: NDArray[np.bool_]) -> float:
 
 
 def _difference(y: Array, s: Array, inside: NDArray[np.bool_], limit: float) -> tuple[float, float]:
-    """By how much the units `inside` [n] differ from the others, and ln of the probability that chance does it.
+    """Difference of the units `inside` [n] from the others, and ln of its probability by chance.
 
     Units that are odd on their own side count on neither."""
     side_of = np.where(inside, np.median(y[inside]), np.median(y[~inside]))

@@ -80,7 +80,7 @@ def _prior(population: Population) -> Prior:
 
 
 def _of_lots(population: Population) -> np.ndarray:
-    """By how much each unit [n] is off for its lot, or for its side of two groups: its own, unlike a station's part."""
+    """Offset of each unit [n] by its lot, or by its side of two groups: its own, unlike a station's part."""
     shift = np.zeros(population.measured.at.size)
     for apart in population.apart:
         if apart.kind in ("lot", TWO_GROUPS) or any(name.startswith("lot ") for name in apart.also):

@@ -113,8 +113,8 @@ def spread(
     `scheduler`: address of a Dask scheduler, whose workers have this package. `results`: the folder that keeps finished
     jobs; `settings`: as `Kept` has them. `count`: workers here, by default as many as processors. `lost`: the rows of a
     job whose workers die; without it such a job ends the work. `weights` [jobs]: the work of each, for the remaining
-    time. `verb`: who writes the progress on stderr where there is no terminal; "": nobody.
-    Raises UserError for a package that is absent and a scheduler that does not answer.
+    time. `verb`: who writes the progress on stderr without a terminal; "": nobody. Raises UserError for a package that
+    is absent and a scheduler that does not answer.
     """
     if count is not None and count < 1:
         raise UserError("--workers must be at least 1")
@@ -145,7 +145,7 @@ class _Remaining(Doing):
         self.weights, self.left, self.worked, self.jobs = weights, sum(weights), 0.0, 0
 
     def done(self, jobs: Iterable[int]) -> None:
-        """These were done by an earlier run."""
+        """Count jobs that an earlier run did."""
         for k in jobs:
             self.left -= self.weights[k]
             self.jobs += 1

@@ -165,7 +165,7 @@ class _Directions:
 
     @staticmethod
     def of(theta: Array, tumble: Tumble) -> _Directions:
-        """At parameters."""
+        """The directions at parameters `theta`."""
         force, to, M = forces(theta, tumble.accel, tumble.warmth)
         size = np.linalg.norm(force, axis=1)[:, None]
         u = force / size

@@ -27,8 +27,8 @@ WRITTEN = (".asc", ".blf", ".csv", ".log", ".mcap", ".trc")
 #: Suffixes of binary logs.
 BINARY = (".blf", ".mcap")
 
-#: Of Vector's BLF: sizes of the file's header and of the file, then an object's signature, size and kind; a
-#: container's own header.
+#: Vector's BLF: sizes of the file's header and of the file, then an object's signature, size and kind; a container's
+#: own header.
 BLF_HEADER, BLF_OBJECT = struct.Struct("<4sL8xQ"), struct.Struct("<4s4xLL")
 BLF_CONTAINER, BLF_CONTAINER_HEAD, BLF_ZLIB = 10, 16, b"\x02\x00"
 

@@ -47,7 +47,7 @@ class Asked:
 
     @property
     def options(self) -> tuple[tuple[str, str], ...]:
-        """The same as the command line says it."""
+        """The options as the command line has them."""
         given = [] if self.rate is None else [("--rate", f"{self.rate:.15g}")]
         for option, pairs in (("--column", self.columns), ("--unit", self.units)):
             given += [(option, f"{name}={value}") for name, value in pairs.items()]
@@ -83,7 +83,7 @@ class Header:
         #: Columns of a table that lack a unit, or the size of a count: heading, name here, and the usual unit.
         self.without_unit: list[tuple[str, str, str]] = []
         self.without_size: list[tuple[str, str, str]] = []
-        #: Those without a unit that begin with a whole number.
+        #: Headings of columns without a unit that begin with a whole number.
         self.whole: set[str] = set()
 
     def of_part(self, several: bool) -> Header:

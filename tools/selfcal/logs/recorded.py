@@ -60,7 +60,7 @@ class Recording:
     started_s: float | None = None
     since_power_on_s: float = 0.0
     notes: tuple[str, ...] = ()
-    #: What of the files could not be read.
+    #: Damage: parts of the files that could not be read.
     damaged: Damaged = SOUND
     #: The files, where there are several: `path` has them all for messages.
     paths: tuple[Path, ...] = ()

@@ -379,7 +379,7 @@ def _exactly(stamps: _Stamps, dt: float) -> _Fit | None:
 
 
 def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
-    """Of samples that are stamped within so large a share of a lattice step. None where they are not."""
+    """The law of samples that are stamped within a `share` of a lattice step, else None."""
     best, index, asleep = None, np.arange(stamps.time.size), np.append(False, stamps.asleep)
     slack, first = share * stamps.lattice, (0.0, share * stamps.lattice)
     for again in range(5):

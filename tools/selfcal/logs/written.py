@@ -115,9 +115,9 @@ def _rows(stamps: Sequence[Array], near_s: float) -> tuple[Array, list[Rows]]:
 def clocks_of(
     path: object, meta: Mapping[str, Any], t: Array, marks: Mapping[str, Array], places: Rows | None
 ) -> list[tuple[list[str], Clock, Rows]]:
-    """Of each clock that `meta` states the columns' names, the clock and the rows of its samples in a table with the
-    stamps `t` [n], s, and the further columns `marks`. `places` [n]: lines of the rows, some of which
-    were skipped. Raises UserError."""
+    """For each clock that `meta` states: the columns' names, the clock and the rows of its samples in a table with the
+    stamps `t` [n], s, and the further columns `marks`. `places` [n]: lines of the rows, some of which were skipped.
+    Raises UserError."""
     clocks = []
     for number, (entry, ending) in enumerate(zip(meta["clocks"], _endings(len(meta["clocks"])), strict=True)):
         mark = marks.get(SAMPLE + ending)

@@ -15,7 +15,7 @@ from selfcal.base.grid import Array
 
 #: Forms, the simplest first.
 FORMS = ("static", "lag", "rate", "square", "cube", "play", "delay", "free")
-#: Those that no module makes.
+#: Forms that no module makes.
 HOST_FORMS = ("play", "delay", "free")
 #: Entry with a form's number.
 NUMBER = {"lag": "lag_s", "rate": "window_s", "play": "width", "delay": "delay_s"}

@@ -71,7 +71,7 @@ class Misread:
 
     @property
     def sd(self) -> float:
-        """Of the share of codes that are not alike."""
+        """sd of the share of codes that are not alike."""
         return 0.0 if self.undone is None else math.sqrt(2.0 * self.share / self.undone.size)
 
 
@@ -133,7 +133,7 @@ class Cells:
     def __init__(self, y: Array, step: float) -> None:
         commonest, most, self.noise = noise_beside(y)
         self.pile = None
-        if not step > 0.0 and most >= CHANGED_LEAST:  # it may lie beside the lattice of the others
+        if not step > 0.0 and most >= CHANGED_LEAST:  # it may lie off the lattice of the others
             others = y[y != commonest]
             step = step_of(others)[0]
             beside = step > FINE * self.noise or most > STANDS_OUT * np.unique(others, return_counts=True)[1].max(
@@ -186,7 +186,7 @@ class Cells:
 
     @cached_property
     def true(self) -> list[tuple[Array, Array]]:
-        """Of each noise the levels, and the chance [parts, levels] of parts of codes."""
+        """The levels for each noise, and the chance [parts, levels] of parts of codes."""
         chances = []
         # The mean of a piece is within two noises of its level, unless the readings are folded.
         mean = self.count @ (self.origin + self.width * np.append(np.arange(self.many - 1) + self.first, 0))
@@ -242,7 +242,7 @@ class Cells:
         return np.asarray(self.of_pieces(fit) @ self.count.sum(axis=1))
 
     def gain(self, rival: _Map, expected: Array) -> float:
-        """Of ln likelihood of the counts of all pieces together by a map, over those `expected` [codes] without it."""
+        """Gain of a map in ln likelihood of the counts of all pieces, over the counts `expected` [codes] without it."""
         floor = ODD * float(self.total.sum()) / self.many
         return float(self.total @ np.log((rival.read(expected) + floor) / (expected + floor)))
 
@@ -324,8 +324,8 @@ def _of_places(cells: Cells, over: Array, near: _Map | None = None) -> Iterator[
 
 
 def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
-    """The map of readings [n], NaN where there is none, that explains their codes best; None where all are read alike,
-    or their counts show nothing: on a lattice that is coarse against the noise, or in too few readings."""
+    """The map of readings [n] (NaN: missing) that explains their codes best; None where all are read alike, or their
+    counts show nothing: on a lattice that is coarse against the noise, or in too few readings."""
     known = np.flatnonzero(np.isfinite(values))
     y = values[known]
     if y.size < READINGS_LEAST or (not noise_beside(y)[2] > 0.0 if lattice is None else lattice.too_coarse):

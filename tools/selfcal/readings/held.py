@@ -82,7 +82,7 @@ class Slower:
 
 
 def slower(values: Array) -> list[Slower]:
-    """Stretches of readings [n], NaN where there is none, in which the part or the logger ran at a part of its rate.
+    """Stretches of readings [n] (NaN: missing) in which the part or the logger ran at a part of its rate.
 
     In a stretch every row but each `ratio`th repeats. A repeat counts by its chance: the share of the readings equal to
     a reading two to four rows before, or the share of equal new readings in the stretch if larger.

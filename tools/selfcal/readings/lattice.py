@@ -53,7 +53,7 @@ class Lattice:
 
     @property
     def most(self) -> float:
-        """Coarseness beyond which the noise is below the lattice. Of a counter it is: else no remainder would show."""
+        """Coarseness beyond which the noise is below the lattice. A counter's is: else no remainder would show."""
         return COARSEST if self.carried else BELOW_LATTICE
 
     @property
@@ -69,7 +69,7 @@ class Lattice:
         return math.floor(rate / digit) * digit
 
     def too_coarse_over(self, interval_s: float) -> bool:
-        """The same of means over an interval. Those of a counter have white remainders (quantization noise)."""
+        """Whether means are too coarse. Long means of a counter have white remainders (quantization noise)."""
         return self.too_coarse and self.carried * interval_s < WHITE_REMAINDERS
 
 
@@ -121,8 +121,8 @@ def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
 
 
 def _step(unique: NDArray[np.floating[Any]]) -> float:
-    """The spacing of the lattice that all values lie on, 0 if there is none: the smallest difference between values,
-    where every difference is a whole multiple of it; or to the last digit of values that are printed with few."""
+    """The spacing of the lattice that all values lie on, else 0: the smallest difference between values, where every
+    difference is a whole multiple of it; or to the last digit of values that are printed with few."""
     gaps = np.diff(unique)
     gaps = gaps[gaps > ROUNDED * np.abs(unique).max(initial=0.0)]
     if not gaps.size:

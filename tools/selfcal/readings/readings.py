@@ -250,7 +250,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
 
 
 def _known(values: NDArray[Any]) -> NDArray[Any]:
-    """Those of the values that are finite; no copy where all are."""
+    """The finite values; no copy where all are finite."""
     finite = np.isfinite(values)
     return values if finite.all() else values[finite]
 

@@ -127,7 +127,7 @@ class Ensemble:
 
 
 def chosen_rivals(only: Sequence[str]) -> list[Rival]:
-    """Those named, in the order of the table. Raises UserError for a name that there is not."""
+    """The rivals in `only`, or all, in the order of the table. Raises UserError for an unknown name."""
     for name in only:
         if name not in RIVALS:
             raise UserError(f"--only: there is no rival '{name}' ({', '.join(RIVALS)})")

@@ -49,7 +49,7 @@ class KnownModels:
 
 
 def _ids(model: Model, start: Start | None, interval_s: float, block: int) -> Iterator[int]:
-    """Of the model's tables for each target and each choice of axes that telemetry can carry, in the model's order."""
+    """Ids of the model's tables for each target and choice of axes that telemetry can carry, in the model's order."""
     if not 0.0 < interval_s < math.inf or block < 1:
         return
     sent = [axis for axis in model.axes if axis in AXES]

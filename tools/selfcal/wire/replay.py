@@ -179,7 +179,7 @@ def _make(name: str, target: str, root: Path, folder: Path) -> None:
     """Make a firmware in `folder`, which is relative to `root`: a path to that may hold spaces."""
     check_programs(target)
     command = ["make", "-s", "-f", f"port/{name}/{name}.mk", name, f"MODEL_DIR={folder}", f"OUT={folder}"]
-    # Of a `make` around this program nothing is passed on: neither its options nor its variables.
+    # Do not pass on the options and variables of a `make` around this program.
     environment = {key: value for key, value in os.environ.items() if key not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
     try:
         command.append(f"CORE={target}")

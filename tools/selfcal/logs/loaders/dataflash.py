@@ -165,7 +165,7 @@ def _fits(crc: int, stated: bytes) -> bool:
 
 
 def _tlog(data: Bytes, lost: list[Damaged]) -> Iterator[tuple[str, str, list[str], list[float]]]:
-    """The same of a ground station's log. What is damaged joins `lost`.
+    """Like `_bin`, for a ground station's log. Damage joins `lost`.
 
     A message is a stamp of 8 bytes and a frame of MAVLink, which has a checksum.
     """

@@ -199,7 +199,7 @@ def sensors_of(
 
 
 def number_of(keys: Sequence[str]) -> str | None:
-    """The heading of the column that numbers the sensors, where there is one."""
+    """The heading of the column that numbers the sensors, if any."""
     return next((key for key in keys if split(key)[0].lower() in _NUMBERS), None)
 
 

@@ -32,7 +32,7 @@ _SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nanosec", "nsecs"
 #: The first and the last bytes of a file; a record's kind and length; the kind of a chunk.
 _MAGIC, _HEAD = b"\x89MCAP0\r\n", struct.Struct("<BQ")
 _CHUNK = b"\x06"
-#: What of a message's fields is a sensor's by convention.
+#: Beginnings of a message's fields that are a sensor's by convention.
 _BY_CONVENTION = ("angular_velocity/", "linear_acceleration/")
 
 

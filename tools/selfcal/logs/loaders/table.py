@@ -85,7 +85,7 @@ class Table:
     notes: tuple[str, ...] = ()
     damaged: Damaged = SOUND
 
-    #: Of a text: its name, headings, the lines before them, their line in messages, and the cells of the first row.
+    #: A text's name, headings, the lines before them, their line in messages, and the cells of the first row.
     name: str = ""
     headings: Sequence[str] = ()
     before: Sequence[str] | None = None

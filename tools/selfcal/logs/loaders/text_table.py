@@ -131,7 +131,7 @@ class TextReader:
         #: With `skip_bad`, after `columns`: int64[n], the place of each row among the lines after the header.
         self.places: NDArray[np.int64] | None = None
         self._origin: datetime | None = None
-        #: Of a time of day: the first, the last, and the days since, s.
+        #: First and last time of day, and the days since, s.
         self._day = (math.nan, math.nan, 0.0)
         #: Units after the numbers of a cell, by column.
         self._ending: dict[int, str] = {}

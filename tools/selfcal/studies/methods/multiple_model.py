@@ -75,8 +75,8 @@ def kalman_filter(problem: Problem, law: str, theta: Floats) -> KalmanFilter:
 
 
 def estimates(problem: Problem, law: str, theta: Floats, weight: Floats) -> dict[str, Value]:
-    """Of each parameter the median and the interval, its density flat in ln within a cell. A law whose weight is no
-    longer a number of the machine has none."""
+    """Median and interval of each parameter, its density flat in ln within a cell. NaN if all weights underflow to
+    0."""
     if not weight.any():
         return {name: Value(math.nan) for name in NAMED[law].parameters}
     mass = weight / weight.sum()

@@ -18,7 +18,7 @@ def steady_state(problem: Problem) -> Answer:
 
 
 def ln_likelihood(problem: Problem, law: str, ln_theta: Floats) -> float:
-    """Of all samples but the first, or about the best constant where the law has a mean."""
+    """ln likelihood of all samples but the first, or about the best constant where the law has a mean."""
     y = problem.y
     r = math.exp(2.0 * ln_theta[0]) / problem.dt_s
     phi, q = map(float, problem.step(law, ln_theta) if law != "constant" else (0.0, 0.0))

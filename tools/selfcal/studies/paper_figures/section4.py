@@ -96,7 +96,7 @@ class Rms:
 
 
 def _rms(values: Sequence[Sequence[float]], stated: Sequence[Sequence[float]], truth: float) -> Rms:
-    """Of values and their stated sd of the logarithm, [records][marks]. A few Allan fits state none."""
+    """Real rms and median stated sd of ln `values`, by mark, of [records][marks]. A few Allan fits state no sd."""
     real = np.sqrt(((np.log(values) - math.log(truth)) ** 2).mean(axis=0))
     columns = [column[np.isfinite(column)] for column in np.array(stated).T]
     return Rms(real, np.array([np.median(column) if column.size else math.nan for column in columns]))
