@@ -1,7 +1,7 @@
 """The Allan deviation of a record and of the laws: closed forms, and how far apart the two may be.
 
 Every law is a sum of terms: white noise, a random walk, Gauss-Markov drifts. With X the sum of the readings of a term,
-an even function G suffices here: for weights that remove a line, the covariance of two weighted sums of X is the sum of
+an even function G suffices here. For weights that remove a line, the covariance of two weighted sums of X is the sum of
 the weights times G at the distance between them. At m readings apart
 
     u_k = (X_(k+2m) - 2 X_(k+m) + X_k) / m,     Allan variance = E[u^2] / 2,     and Cov(u_k, u_(k+j)) follow from G.
@@ -43,7 +43,7 @@ PER_OCTAVE = 4
 @dataclass(frozen=True)
 class Terms:
     """A law at given parameters, per reading: the white noise's `variance` and its correlation `lag1` with the reading
-    before, the variance of the walk's `step`, and each Gauss-Markov drift's variance and its bandwidth times the
+    before, the variance of the walk's `step`. `markov`: each Gauss-Markov drift's variance, and its bandwidth times the
     interval between readings. An oscillation is the real part of a drift with complex numbers. `lacking`: variance of
     white noise that the drift's averages lack (laws.averaged)."""
 

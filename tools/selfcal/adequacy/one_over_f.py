@@ -106,7 +106,7 @@ class Beside:
 
 @dataclass(frozen=True)
 class Rerun:
-    """Input of an engine for the only axis of `tables`, for another law: `samples` [n] less `offset` (see Bank) after
+    """Input of an engine for the only axis of `tables`, for another law. `samples` [n] less `offset` (see Bank) after
     `missing_before` [n], and `columns` [n, p] of which those of `mask` are in use."""
 
     tables: Tables

@@ -120,7 +120,7 @@ def column_of(regressor: Regressor, channel: Array, rate_hz: float) -> Array:
 
 def bracket(lacks: Callable[[int], bool], least: int) -> tuple[int, int | None]:
     """The bank samples of the longest record tried that lacks something, 0 for none, and of a shortest record that has
-    it: longer by ALIKE at most, None beyond MOST."""
+    it. The latter is longer by ALIKE at most, None beyond MOST."""
     low, high = 0, least
     while lacks(high):
         low, high = high, 2 * high

@@ -37,7 +37,7 @@ _POINTS, _LEAST, _MOST = 160, 1e-3, 100.0
 FALSE_NAME = 0.03
 #: Largest share of odd units, and the most numbers of odd units that are tried.
 MOST_ODD, _TRIED = 1.0 / 3.0, 40
-#: Evidence of two groups over a single group, nats: normal batches of 8 to 24 units exceed it as if the second mean,
+#: Evidence of two groups over a single group, nats. Normal batches of 8 to 24 units exceed it as if the second mean,
 #: the share and the cut were three numbers more.
 _SPLIT = 0.5 * float(chdtri(3, FALSE_ALARM))
 

@@ -89,8 +89,8 @@ def _of_lots(population: Population) -> np.ndarray:
 
 
 def _odds(model: Model, batch: Batch) -> dict[str, float]:
-    """Prior odds of each law, the mean over the model's axes: of an axis in the batch the share of the units, and a
-    unit more of each law; of any other axis the model's."""
+    """Prior odds of each law, the mean over the model's axes. An axis in the batch has the share of the units, and a
+    unit more of each law. Any other axis has the model's odds."""
     there = set(axes_of(batch.devices))
     total = dict.fromkeys(model.hypotheses, 0.0)
     for axis in model.axes:

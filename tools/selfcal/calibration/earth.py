@@ -18,7 +18,7 @@ HEIGHTS, GRAVITIES = (-500.0, 10_000.0), (9.7, 9.9)
 
 @dataclass(frozen=True)
 class Place:
-    """`gravity`, m/s^2, with its `sd`; the Earth's rate, rad/s: `vertical` part (None: unknown) and the sd of each of
+    """`gravity`, m/s^2, with its `sd`. The Earth's rate, rad/s: `vertical` part (None: unknown) and the sd of each of
     its other parts, `level_sd` of the two in the level plane, `vertical_sd` of the unknown vertical part. `words`:
     where gravity is from."""
 

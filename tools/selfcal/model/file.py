@@ -236,7 +236,7 @@ GridNodes = Mapping[str, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class HiddenInput:
-    """A quantity that nobody recorded and that moves several axes, a Gauss-Markov process: its standard deviation, its
+    """A quantity that nobody recorded and that moves several axes, a Gauss-Markov process. Its standard deviation, its
     bandwidth `alpha`, 1/s, what a unit of it does to each axis, in the axis' unit, and the correlation of the white
     noise of pairs of axes (`gx-gy`). The bank of an axis knows nothing of it: its law is the axis' total."""
 

@@ -26,7 +26,7 @@ SHARES: Mapping[str, float] = MappingProxyType(
     }
 )
 
-#: Share of modules of six axes at rest with noise and a drift alone that are called unsound, by: a look at an axis (a
+#: Share of modules of six axes at rest with noise and a drift alone that are called unsound. By a look at an axis (a
 #: check of `identify`, a cause of `diagnose`), all axes together, the statistics of the innovations of an axis, and
 #: their coherence with the channels. The sum keeps 2 in 100. With a fifth of its share all axes together miss 2 of 24
 #: causes of 30 nats (`make hidden-several`, seeds 470 and 471).

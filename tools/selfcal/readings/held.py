@@ -84,8 +84,8 @@ class Slower:
 def slower(values: Array) -> list[Slower]:
     """Stretches of readings [n] (NaN: missing) in which the part or the logger ran at a part of its rate.
 
-    In a stretch every row but each `ratio`th repeats. A repeat counts by its chance: the share of the readings equal to
-    a reading two to four rows before, or the share of equal new readings in the stretch if larger.
+    In a stretch every row but each `ratio`th repeats. A repeat counts by its chance. That is the share of readings
+    equal to a reading two to four rows before, or of equal new readings in the stretch if larger.
     """
     n = values.size
     if n < 4 * RATIO_MOST:

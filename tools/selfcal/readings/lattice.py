@@ -121,8 +121,8 @@ def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
 
 
 def _step(unique: NDArray[np.floating[Any]]) -> float:
-    """The spacing of the lattice that all values lie on, else 0: the smallest difference between values, where every
-    difference is a whole multiple of it; or to the last digit of values that are printed with few."""
+    """The spacing of the lattice that all values lie on, else 0. It is the smallest difference between values, if every
+    difference is a whole multiple of it, or is to the last digit of values printed with few."""
     gaps = np.diff(unique)
     gaps = gaps[gaps > ROUNDED * np.abs(unique).max(initial=0.0)]
     if not gaps.size:

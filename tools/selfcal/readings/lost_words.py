@@ -40,8 +40,8 @@ class Recurring:
 
 
 def recurring_of(values: Array, explained: Misread | None) -> Recurring | None:
-    """The value that recurs most surely in readings [n] (NaN: missing): a value with hardly another reading near it, or
-    the word that the likelihood of the codes `explained`."""
+    """The value that recurs most surely in readings [n] (NaN: missing). It is a value with hardly another reading near
+    it, or the word that the likelihood of the codes `explained`."""
     known = np.isfinite(values)
     y = values if known.all() else values[known]
     if y.size < 8 * AROUND:

@@ -244,7 +244,7 @@ def draw(figure: Figure) -> Markup:
 
 
 def strips(figure: Figure, marks: Sequence[tuple[float, float, str]]) -> Markup:
-    """The figure in HTML with its panels below each other over a common x, each on its own scale; `marks`: begin and
+    """The figure in HTML with its panels below each other over a common x, each on its own scale. `marks`: begin and
     end of events with the text that stands above them."""
     right, bottom = STRIP_WIDTH - RIGHT, TOP + STRIP * len(figure.panels)
     x = _Scale(*_x_limits(figure), False, STRIP_LEFT, right - STRIP_LEFT)

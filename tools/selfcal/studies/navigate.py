@@ -67,7 +67,7 @@ def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
     """By AXES: the noise of a rest [REST_S, axes] in their units, with the spread of its posterior.
 
     N has the mean square of all laws. Where the constant is the most probable law, there is no drift. Else the drift
-    has the variance that the bank predicts HORIZONS_S ahead, of all laws and nodes (`matched`): the variance of a
+    has the variance that the bank predicts HORIZONS_S ahead, of all laws and nodes (`matched`). The variance of a
     single law at its median is too small where another law or a larger drift is possible.
     """
     from selfcal.bank.library import Bank

@@ -1,7 +1,7 @@
 """ROS 1 bags and ROS 2 bags by rosbags: `sensor_msgs/Imu` and `sensor_msgs/Temperature`, a table a topic.
 
 The stamps are those of the messages' headers, never the times at which the bag got them. Messages of these two types
-have the same layout in every ROS, so that the definitions in a bag, which rosbags would make code of, are not used.
+have the same layout in every ROS. So the definitions in a bag, which rosbags would make code of, are not used.
 """
 
 from __future__ import annotations
