@@ -113,7 +113,8 @@ def repeats_of(stretches: Sequence[Slower], n: int) -> Mask:
 
 
 def equal_by_chance(values: Array) -> float:
-    """Share of readings [n] equal to a reading two to four rows before: by chance alone, on any lattice too."""
+    """Share of readings [n] equal to a reading 2 to 4 rows before: by chance alone, on a lattice of several steps
+    too."""
     return sum(float(np.count_nonzero(values[k:] == values[:-k])) for k in (2, 3, 4)) / (3.0 * values.size)
 
 
