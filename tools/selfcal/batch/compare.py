@@ -95,9 +95,7 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
         cause = str(finding["cause"])
         counted[cause] = counted.get(cause, 0) + 1
         label = cause if counted[cause] == 1 else f"{cause} {counted[cause]}"
-        own_sizes = {
-            key: size for key in SIZES if isinstance(size := finding["estimate"].get(key), Mapping)
-        }
+        own_sizes = {key: size for key in SIZES if isinstance(size := finding["estimate"].get(key), Mapping)}
         first: Mapping[str, Any] = next(iter(own_sizes.values()), {})
         size = {part: first[part] for part in ("median", "unit") if part in first}
         sizes[label] = {"present": True, "small": cause not in matter, **size}

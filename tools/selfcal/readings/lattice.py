@@ -121,8 +121,8 @@ def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
 
 
 def _step(unique: NDArray[np.floating[Any]]) -> float:
-    """The spacing of the lattice that all values lie on, else 0. It is the smallest difference between values, if every
-    difference is a whole multiple of it, or is to the last digit of values printed with few."""
+    """The spacing of the lattice that all values lie on, else 0. It is about the smallest difference between values.
+    Every difference is a whole multiple of it, to the last digit of values printed with few."""
     gaps = np.diff(unique)
     gaps = gaps[gaps > ROUNDED * np.abs(unique).max(initial=0.0)]
     if not gaps.size:

@@ -181,7 +181,8 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     misread = spans_of(values)
     if misread is not None and misread.undone is not None:
         values = misread.undone
-    # Readings beyond the part's range are no readings: the engines leave them out. Many of them count as clipped.
+    # Readings beyond the part's range are no readings: the engines leave them out. Many of them count as clipped,
+    # where the median is near the range.
     inside = within(values, group)
     if not (inside.any() and np.ptp(values[inside]) > 0.0):
         return Readings(recording, values, values, values, None, none, none, misread=misread)

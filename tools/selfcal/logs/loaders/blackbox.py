@@ -207,7 +207,7 @@ class _Log:
                 if kind not in b"IP" or (kind in b"P" and not history):
                     continue
                 values = self._predicted(values, predictors, history if kind in b"P" else [])
-                # Frames 10 s apart are not both sound.
+                # Of frames 10 s apart, or back in time, one is damaged.
                 if history and not 0 < values[self.time] - history[-1][self.time] < 10_000_000:
                     raise _Damaged
             except (_Damaged, IndexError):
