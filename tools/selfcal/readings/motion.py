@@ -1,11 +1,12 @@
 """A sensor that moves, in the raw readings and before any fit: its energy against the energy before and after.
 
-Energy is that of the readings and of short means about their running median: ramps and jumps have little. A window is compared with its louder side, at its own length. So noise that grows, breathes or stays loud is no
-motion. At rest the mean of n squares exceeds r times its expectation with a probability below exp(-n (r - 1 - ln r) /
-2) (Chernoff). Axes are independent at rest. The sensor moves where axes without the loudest are louder together, or
-where an axis is as loud as in no other window of its record. A hand that pushes shows in the level: how far it is from
-a long running median, beyond any noise. At an end of the record one side is missing and noise may have grown: an axis
-alone moves there where most of its readings are pushed.
+Energy is that of the readings and of short means about their running median: ramps and jumps have little. A window is
+compared with its louder side, at its own length. So noise that grows, breathes or stays loud is no motion. At rest the
+mean of n squares exceeds r times its expectation with a probability below exp(-n (r - 1 - ln r) / 2) (Chernoff). Axes
+are independent at rest. The sensor moves where axes without the loudest are louder together, or where an axis is as
+loud as in no other window of its record. A hand that pushes shows in the level: how far it is from a long running
+median, beyond any noise. At an end of the record one side is missing and noise may have grown: an axis alone moves
+there where most of its readings are pushed.
 """
 
 from __future__ import annotations

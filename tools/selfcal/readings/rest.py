@@ -80,7 +80,8 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
 
 def outside_priors(recording: Recording, model: Model, axes: Sequence[str]) -> str:
     """A line on all `axes` whose evidence every law denies. It states the side of the priors, their own Allan deviation
-    at the bank interval, when the sensor moved, and the stretch of rest to type; or to widen the priors, if it rested."""
+    at the bank interval, when the sensor moved, and the stretch of rest to type; or to widen the
+    priors, if it rested."""
     sides: dict[str, list[str]] = {}
     for name in axes:
         side, numbers = _side(recording, model, name)
