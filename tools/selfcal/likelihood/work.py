@@ -27,13 +27,13 @@ class Spent(Stopped):
 
 @dataclass
 class Work:
-    """What is left of it, and whether to stop now."""
+    """Work that is left, and whether to stop now."""
 
     stop: Callable[[], bool]
     left: float = math.inf
 
     def count(self, samples: int, columns: int) -> None:
-        """Raise Stopped or Spent before a pass of so many samples and columns."""
+        """Count a pass over `samples` with `columns`. Raise Stopped on a stop, or Spent if the work is used up."""
         if self.stop():
             raise Stopped
         self.left -= samples * (1.0 + columns)
@@ -50,7 +50,7 @@ def count(samples: int, columns: int) -> None:
 
 
 def of_axis(samples: int) -> Work:
-    """The work that an axis of so many samples may take."""
+    """The work that an axis of this many samples may take."""
     return Work(_now.get().stop, max(MOST, 2.0 * MOST_PASSES * samples))
 
 
