@@ -41,7 +41,7 @@ LN_EITHER = math.log(2.0)
 #: ln factors by which the fitted drift is made smaller to rank shapes again. The last is for slow shapes alone.
 SMALLER = (1.5, 3.0)
 #: Most forms of a family, or events of a search, that are fitted: those that rank best. After the first, a form's score
-#: may lack these nats, plus this share of the best, of the worth that a form needs to be named, or to be as likely.
+#: may lack these nats, plus this share of the best, of the worth that names a form, or makes it as likely.
 FITTED, FIT_ADDS, COARSE = 3, 3.0, 0.05
 #: First and last step of the logarithms of numbers, in the search between nodes of the grid.
 STEP_FIRST, STEP_LAST = 0.35, 0.005
@@ -260,7 +260,7 @@ def look(state: State, cause: str, chosen: Tried) -> Look:
 
 
 def _estimate(chosen: Tried) -> dict[str, Any]:
-    """As the fit has it: its coefficients, and the best numbers alone."""
+    """Estimate of the fit: its coefficients, and the best numbers alone."""
     shape, fit = chosen.shape, chosen.fit
     k = len(shape.columns)
     c, sd = _sizes(shape, fit.c[-k:], fit.sd[-k:])
@@ -301,7 +301,7 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
 
 
 def possible(state: State, shape: Shape) -> tuple[Array, Array]:
-    """As `nodes`, of a shape's numbers, at the drift that is fitted with it."""
+    """`nodes` of a shape's numbers, at the drift that is fitted with it."""
     if not shape.numbers:
         return np.empty((1, 0)), np.empty((0, 0))
     fit = fitted(state, shape).fit

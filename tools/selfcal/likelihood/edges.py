@@ -16,7 +16,7 @@ from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
 from selfcal.likelihood.state import Regressor, State, interval, ln_looks, mixture, net
 from selfcal.likelihood.statemodel import Array, Mask
 
-#: Least share of its information that a step keeps beside the level before it; and the least share of a mid-record
+#: Least share of its information that a step keeps with the level before it; and the least share of a mid-record
 #: step's information at the last place that is looked at.
 INFORMATION_LEAST = 0.05
 #: Turns of a drift in the record above which it gives way to a step: its size is fitted anew with the step, and noise
@@ -49,7 +49,7 @@ class Scan:
         return np.where(self.A > 0.0, 0.5 * self.B**2 / np.where(self.A > 0.0, self.A, 1.0), 0.0)
 
     def free(self, edges: int = 1) -> int:
-        """Number of coefficients that would gain as noise alone does."""
+        """Number of coefficients whose gain noise alone has."""
         return 2 if edges == 1 and self.turns > FORGETS else 1
 
     def price(self, gain: float, edges: int = 1) -> float:

@@ -1,4 +1,4 @@
-"""Maximum likelihood of a noise model with regressors, by one Kalman filter over the record and every column."""
+"""Maximum likelihood of a noise model with regressors, by a Kalman filter over the record and every column."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model: `terms` at `theta`, white noise `sigma` of one sample, coefficients `c` of the columns with their
+    """A fitted model: `terms` at `theta`, white noise `sigma` of a sample, coefficients `c` of the columns with their
     standard deviations `sd`, and `ln_likelihood` at its maximum. `information` [k, k], of a fit: that of `theta`."""
 
     terms: Terms
@@ -155,7 +155,7 @@ class Fit:
         return float(self.theta[self.terms.names.index(name)])
 
     def shrunk(self, by: float) -> Fit:
-        """The same model with a drift smaller by exp(-by), within its limits. Only its parameters are of that drift."""
+        """The fit with a drift smaller by exp(-by), within its limits. Only its parameters are of that drift."""
         low = np.array(self.terms.limits(self.dt)).reshape(-1, 2)[:, 0]
         return replace(self, theta=np.maximum(self.theta - by * self.terms.sizes, low))
 
@@ -183,7 +183,7 @@ class Fit:
 
     @property
     def increment(self) -> float:
-        """Of the counter whose remainders are the quantization noise: sqrt(12) Q, unit times s."""
+        """Increment of the counter whose remainders are the quantization noise: sqrt(12) Q, unit times s."""
         m = math.tanh(self.value("color"))
         return self.sigma * self.dt * math.sqrt(-12.0 * m / (1.0 + m * m))
 
@@ -222,7 +222,7 @@ def run(
 def passed(
     series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances. The filter
+    """A pass as `run`, its sums as arrays: G, D, n and x of each mark, innovations, and their variances. The filter
     whitens each column by itself: where they are too many for one pass, G is of the whitened columns."""
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
     at = list(marks) or [series.y.size]

@@ -70,7 +70,8 @@ class Bins:
         return 2.0 - 2.0 * np.cos(self.turn)
 
     def markov(self, rate: Array) -> tuple[Array, Array]:
-        """The same [k, rates] of Gauss-Markov processes of rates a sample, and its slopes over ln of the rates."""
+        """Spectra [k, rates] of differences of Gauss-Markov processes of variance 1, and slopes over ln of the rates a
+        sample."""
         a, cosine = np.exp(-rate), 1.0 - 0.5 * self.white[:, None]
         power, below = -np.expm1(-2.0 * rate), 1.0 - 2.0 * a * cosine + a * a
         value = power / below * self.white[:, None]
@@ -188,7 +189,7 @@ def _lower(m: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 class _Cost:
     """-ln likelihood and its slope over a vector of parameters: own drifts, the rows of a root of the correlation, and
-    the loadings and ln rate of f if it has one."""
+    the loadings and ln rate of f if the model has f."""
 
     def __init__(self, bins: Bins, f: bool) -> None:
         self.bins, self.f, self.m = bins, f, bins.power.shape[1]
@@ -444,7 +445,7 @@ class Act:
 
 
 def act(score: Array, known: Array) -> Act:
-    """`Act` of a column by the scores [p, m] of its p parts. `known`: information of each part [p, m, m], or of all.
+    """`Act` of a column by the scores [p, m] of its p parts. `known`: information [p, m, m] of each, or [m, m] of all.
 
     Sizes are normal about 0 with the same width for all axes of a set, in standard deviations of each axis' own."""
     p, m = score.shape
@@ -473,8 +474,8 @@ def act(score: Array, known: Array) -> Act:
 
 
 def act_apart(ln_bf: Array, size: Array, sd: Array) -> Act:
-    """`Act` of a column on axes whose drifts have nothing in common, by the ln Bayes factors [m, widths] of each axis
-    alone, its size [m] and the standard deviation of the size [m]."""
+    """`Act` of a column on axes whose drifts have nothing in common. `ln_bf` [m, widths]: ln Bayes factors of each axis
+    alone; its `size` [m], with standard deviation `sd` [m]."""
     total, probability = _over_sets(size.size, lambda sets: ln_bf[sets].sum(axis=1).T)
     held = probability >= 0.5
     return Act(total, probability, np.where(held, size, 0.0)[None], np.where(held, sd, math.inf))

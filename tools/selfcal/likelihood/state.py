@@ -159,7 +159,7 @@ class State:
         return replace(self, y=self.y[:samples], r=self.r[:samples], regressors=cut, fits=()).refit()
 
     def stiffer(self, by: float) -> list[Fit]:
-        """The best fit with a drift smaller by exp(-by), if it has one."""
+        """The best fit with a drift smaller by exp(-by), if it has a drift."""
         return [self.best.shrunk(by)] if self.best.terms.sizes.any() else []
 
     def with_columns(self, more: Array) -> tuple[float, Fit]:
@@ -177,12 +177,12 @@ class State:
         return best(fits).ln_likelihood - self.best.ln_likelihood, tuple(fits)
 
     def fitted_with(self, terms: Terms, more: Array) -> Fit:
-        """The fit of one drift with further columns [k, n]."""
+        """The fit of a drift with further columns [k, n]."""
         return _fit_from(self.series.beside(more), terms, self.fits)
 
     @cached_property
     def sequential(self) -> dict[bytes, Sequential]:
-        """Its scores on held-out time that are known, by their marks."""
+        """Known scores on held-out time, by their marks."""
         return {}
 
     @property
@@ -372,7 +372,7 @@ class Look:
     """A candidate.
 
     gain      nats of ln likelihood; `net`: less the price of its search.
-    estimate  intervals with their units; `measure` makes them beside a model that lacks the look's columns alone.
+    estimate  intervals with their units; `measure` makes them by a model that lacks the look's columns alone.
     changes   the fields of the state that has it.
     when      begin and end, s.
     others    what else it might be.
@@ -396,7 +396,7 @@ class Look:
         return channels[0] == channels[1]
 
     def measured(self, beside: State) -> Look:
-        """The look with the sizes that `measure` has beside a model."""
+        """The look with the sizes that `measure` finds by a model."""
         if self.measure is None:
             return self
         return replace(self, estimate={**self.estimate, **self.measure(beside)})

@@ -82,7 +82,7 @@ class Terms:
 
     @cached_property
     def sizes(self) -> Mask:
-        """Of the parameters those that are ln of sizes of the drift."""
+        """Mask of the parameters that are ln of sizes of the drift."""
         return np.array([PARAMETERS[name].drift for name in self.names], bool)
 
     @cached_property

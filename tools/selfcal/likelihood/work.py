@@ -45,7 +45,7 @@ _now: ContextVar[Work] = ContextVar("work", default=Work(lambda: False))  # noqa
 
 
 def count(samples: int, columns: int) -> None:
-    """As Work has it, of the work that goes on here."""
+    """`Work.count` of the work that goes on here."""
     _now.get().count(samples, columns)
 
 
@@ -65,7 +65,7 @@ def within(work: Work) -> Iterator[None]:
 
 
 def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """In threads: nearly all the time goes into the compiled filter and the transforms, which run side by side."""
+    """Call in threads: nearly all the time goes into the compiled filter and the transforms, which run side by side."""
     jobs = [(copy_context(), item) for item in items]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(lambda job: job[0].run(function, job[1]), jobs))
