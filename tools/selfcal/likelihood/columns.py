@@ -79,8 +79,7 @@ class Shape:
     stated      further entries of the estimate.
     measure     its posterior, of a family that knows more of it than `measured` does.
     whole       of a shape in means: the same at every sample.
-
-    Fewer keys than columns: the last key is the norm of the last two coefficients, sine and cosine of a line.
+    waves       coefficients whose norm is the last key, sine and cosine of a line; 0: each key is a coefficient.
     """
 
     form: str
@@ -97,6 +96,7 @@ class Shape:
     measure: Callable[[State], Mapping[str, Any]] | None = None
     stated: Mapping[str, Any] = field(default_factory=dict)
     whole: Shape | None = None
+    waves: int = 0
 
     def in_means(self, block: int) -> Shape:
         """The shape in means of `block` samples."""
@@ -272,10 +272,10 @@ def _estimate(chosen: Tried) -> dict[str, Any]:
 
 def _sizes(shape: Shape, c: Array, sd: Array) -> tuple[Array, Array]:
     """Coefficients [..., columns] and their deviations as the keys have them."""
-    last = len(shape.keys) - 1
-    if last + 1 == len(shape.columns):
+    if not shape.waves:
         return c, sd
-    own = slice(last, last + 2)
+    last = len(shape.keys) - 1
+    own = slice(last, last + shape.waves)
     norm, mean = np.linalg.norm(c[..., own], axis=-1, keepdims=True), sd[..., own].mean(axis=-1, keepdims=True)
     return np.concatenate([c[..., :last], norm], axis=-1), np.concatenate([sd[..., :last], mean], axis=-1)
 

@@ -130,6 +130,7 @@ def shape(state: State, record: Record, f: float, sd: float = 0.0, multiples: Se
         stated={"harmonics": list(multiples)} if multiples else {},
         sharper=sharper if f < half else None,
         where=lambda fit: {"frequency_hz": interval(f, spread(fit), "Hz")},
+        waves=len(pair(f, record)),
     )
 
 
