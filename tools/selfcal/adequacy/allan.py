@@ -1,8 +1,8 @@
 """The Allan deviation of a record and of the laws: closed forms, and how far apart the two may be.
 
 Every law is a sum of terms: white noise, a random walk, Gauss-Markov drifts. With X the sum of the readings of a term,
-one even function G suffices here: for weights that remove a line, the covariance of two weighted sums
-of X is the sum of the weights times G at the distance between them. At m readings apart
+an even function G suffices here. For weights that remove a line, the covariance of two weighted sums of X is the sum of
+the weights times G at the distance between them. At m readings apart
 
     u_k = (X_(k+2m) - 2 X_(k+m) + X_k) / m,     Allan variance = E[u^2] / 2,     and Cov(u_k, u_(k+j)) follow from G.
 
@@ -39,10 +39,10 @@ PER_OCTAVE = 4
 
 @dataclass(frozen=True)
 class AllanTerms:
-    """A law at one value of its parameters, per reading: the white noise's `variance` and its correlation `lag1` with
-    the reading before, the variance of the walk's `step`, and each Gauss-Markov drift's variance and its bandwidth
-    times the interval between readings. An oscillation is the real part of one whose numbers are complex. `lacking`:
-    variance of white noise that the drift's averages lack (laws.averaged)."""
+    """A law at given parameters, per reading: the white noise's `variance` and its correlation `lag1` with the reading
+    before, the variance of the walk's `step`. `markov`: each Gauss-Markov drift's variance, and its bandwidth times the
+    interval between readings. An oscillation is the real part of a drift with complex numbers. `lacking`: variance of
+    white noise that the drift's averages lack (laws.averaged)."""
 
     variance: float
     lag1: float = 0.0
@@ -216,7 +216,7 @@ def deviations(ratio: float, variance: float) -> float:
 
 
 def ratio_at(deviations: float, variance: float) -> float:
-    """Ratio at so many standard deviations from 1, at least 0."""
+    """Ratio at `deviations` standard deviations from 1, at least 0."""
     ninth = variance / 9.0
     return max(0.0, 1.0 - ninth + deviations * math.sqrt(ninth)) ** 3
 
@@ -242,7 +242,7 @@ class AllanCurve:
     left: Array
 
     def within(self, deviations: float) -> Array:
-        """The record's Allan deviation [t] if it were so many standard deviations above the model's."""
+        """The record's Allan deviation [t] if it were `deviations` standard deviations above the model's."""
         return self.model * np.sqrt([ratio_at(deviations, variance) for variance in self.left.tolist()])
 
 
@@ -326,8 +326,7 @@ def sample_lengths(n: int, block: int) -> Rows:
 
 
 def sampled(values: Array, missing_before: Rows, rate_hz: float, m: Rows) -> Sampled:
-    """At `m` samples. `values` [n], NaN where a sample is not used, after `missing_before` [n] missing
-    ones each.
+    """At `m` samples. `values` [n], NaN where a sample is not used, after `missing_before` [n] missing samples each.
 
     No window has a gap in it. The interval is that of chi-square with the degrees of freedom of the power law that has
     the curve's slope.
@@ -335,7 +334,7 @@ def sampled(values: Array, missing_before: Rows, rate_hz: float, m: Rows) -> Sam
     values = values.astype(np.float64)  # its sums of 10^6 and more readings in float32 are off by 1e-4 and more
     n = int(np.isfinite(values).sum())
     parted = np.insert(values - np.nanmean(values), np.flatnonzero(missing_before), np.nan)
-    each = (overlapping_variance(parted, length) for length in m.tolist())  # a mask of all samples each: one at a time
+    each = (overlapping_variance(parted, length) for length in m.tolist())  # a mask of all samples each: in turn
     variance, count = np.array([(value, whole.sum()) for value, whole in each]).T
     kept = (variance > 0.0) & (count >= m)
     m, deviation = m[kept], np.sqrt(variance[kept])

@@ -94,7 +94,7 @@ def with_rate(
     the white noise.
 
     `values` [n]: the readings, NaN where there is none; `step` of their lattice. Differences over one and two readings
-    part their white noise from a walk. Where it is the larger one, averages over the time in which both are alike show
+    part their white noise from a walk. If the noise is larger, averages over the time in which both are alike show
     it. Else the part filters its noise, which is white in averages over many times the filter's. Without such a corner
     in the record there is no rate.
     """  # fmt: skip
@@ -148,9 +148,9 @@ def _distance(estimate: Estimate, prior: Prior) -> float:
 def with_readings(
     judged: Judged, readings: Readings, group: Group, unit: str, dt_s: float, *, as_fed: bool = False
 ) -> Judged:
-    """The same with the checks of the readings. `unit`: the recording's. `dt_s`: the bank's interval.
+    """`judged` with the checks of the readings. `unit`: the recording's. `dt_s`: the bank's interval.
 
-    `lattice`, if they lie on one: is their noise above it, or carried on to the next reading? `value`: steps in the
+    `lattice`, if they have a lattice: is their noise above it, or carried on to the next reading? `value`: steps in the
     noise of a reading; `step` in the recording's unit; `distinct` readings; of a counter that fails `counter_hz`: the
     rate of means whose remainders are white.
     Faults of the readings (readings/faults.py), if there are any: the share of readings that each is about.
@@ -227,9 +227,9 @@ def allan_checks(curve: AllanCurve) -> dict[str, dict[str, Any]]:
 
 
 def allan_limit(curve: AllanCurve) -> float:
-    """How many standard deviations an averaging time may be off. All together fail as often as one other check
-    (CHECK_LIMIT): a single one counts as outside beyond the limit that makes this so (Bonferroni's). Once one is, every
-    one beyond CHECK_LIMIT is named."""
+    """Largest deviation of an averaging time that passes, sd. All times together fail as often as another check
+    (CHECK_LIMIT): Bonferroni's limit for each time. If any time exceeds that limit, every time beyond CHECK_LIMIT is
+    named."""
     off = np.abs(curve.deviations[curve.octave])
     alone = float(-ndtri(ndtr(-CHECK_LIMIT) / max(off.size, 1)))
     return CHECK_LIMIT if bool((off > alone).any()) else alone
@@ -239,7 +239,7 @@ def innovation_checks(
     blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used: list[int]
 ) -> dict[str, dict[str, Any]]:
     """Are the innovations of the most probable law, at its posterior medians and with the columns `used`, of mean 0 (a
-    ramp that a random walk follows leaves one), white, normal and of one variance?"""
+    ramp that a random walk follows leaves a mean), white, normal and of equal variance?"""
     from selfcal import _reference
 
     law = group.laws[result.best]
@@ -259,7 +259,7 @@ def innovation_checks(
         np.ascontiguousarray(z[:, used]) if used else None,
         sd[used] if used else None,
         tables.block,
-    )[1 + len(used) :]  # the first ones are the bias and the coefficients
+    )[1 + len(used) :]  # the first are the bias and the coefficients
     pairs = np.isfinite(nu[1:]) & np.isfinite(nu[:-1])
     whole = nu[np.isfinite(nu)]
     n = whole.size

@@ -29,7 +29,7 @@ def has_nodes(law: Law, truth: Mapping[str, float], tables: Tables) -> bool:
 def simulate_bank_samples(
     law: str | Law, truth: Mapping[str, float], rate_hz: float, samples: int, seed: int, bank_block: int = 1
 ) -> tuple[Array, float]:
-    """One simulated axis y [samples] at `rate_hz`, without lattice or range; and x0 + drift at the last sample.
+    """A simulated axis y [samples] at `rate_hz`, without lattice or range; and x0 + drift at the last sample.
 
     Of `bank_block` samples a bank interval coloured noise is a moving average.
 

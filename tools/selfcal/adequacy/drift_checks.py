@@ -27,8 +27,8 @@ from selfcal.model.forms import formed, slope, variance_of
 from selfcal.model.tables import Tables
 from selfcal.readings.budget import CLEARLY
 
-#: Sizes of the drift that are tried with a column, as ln of a divisor. A smaller one must be clearly better: noise that
-#: axes share is no drift.
+#: Sizes of the drift that are tried with a column, as ln of a divisor. A smaller drift must be clearly better: noise
+#: that axes share is no drift.
 DRIFT_DIVISORS = (0.0, 0.7, *SMALLER)
 #: Fewest means that are looked at: fewer show no drift.
 MEANS_LEAST = 60
@@ -42,9 +42,9 @@ def drift_checks(
     blocks: Blocks, tables: Tables, result: AxisResult, recording: Recording, others: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
     """`channel`: which of the columns `others` explains most of the record, its `form`, and the evidence net of the
-    search, nats. `turn_on`: the same of a bias that settles, by `tau_s`. `jump`: of one that jumps, at `time_s` of the
-    recording. Nothing where the record is too short, and where the likeliest law is no simple one: then the simple ones
-    leave a drift that any column may take."""
+    search, nats. `turn_on`: the same of a bias that settles, by `tau_s`. `jump`: of a bias that jumps, at `time_s` of
+    the recording. Nothing where the record is too short, and where the likeliest law is a sum: then simple laws leave a
+    drift that any column may take."""
     likeliest = max(result.probability, key=lambda law: result.probability[law])
     simple = any(not hypothesis.law.is_sum and hypothesis.name == likeliest for hypothesis in tables.hypotheses)
     state, cells = _state(blocks, tables)
@@ -73,8 +73,8 @@ def drift_checks(
 def _check(
     state: State, shapes: Sequence[Shape], stated: Callable[[Shape], dict[str, Any]], *, drift: bool = True
 ) -> dict[str, Any]:
-    """The best of some shapes: what it is worth net of the search, and what is `stated` of it. It is worth nothing if
-    it explains no `drift`: a drift must be clearly likelier than none, and with the shape a smaller one."""
+    """The best of some shapes: its worth net of the search, and what is `stated` of it. It is worth nothing if it
+    explains no `drift`: a drift must be clearly likelier than no drift, and with the shape a smaller drift."""
     trials = columns.tried(state, shapes, slow=True, least=SCREEN).values()
     best = max(trials, key=lambda trial: trial.net, default=None)
     shape, worth = (shapes[0], 0.0) if best is None else (best.shape, best.net)
@@ -90,12 +90,12 @@ def _check(
 
 
 def _shape(label: str, values: Array, looks: int, **stated: Any) -> Shape:
-    """One column of a search among so many."""
+    """A column of a search among `looks` columns."""
     return Shape(label, values[None], (), (("coefficient", ""),), math.log(looks) + LN_SLOW, stated=stated)
 
 
 def _state(blocks: Blocks, tables: Tables) -> tuple[State, int]:
-    """The record about its mean, averaged over so many bank intervals that it is short enough."""
+    """The record about its mean, averaged to MEANS_MOST means at most, and the bank intervals in a mean."""
     cells = max(1, math.ceil(blocks.mean.size / MEANS_MOST))
     mean, used = half_means(blocks.mean - np.nanmean(blocks.mean), cells)
     r = block_means(blocks.r, cells) * cells / np.maximum(used, 1)
@@ -117,7 +117,7 @@ def _channels(state: State, begin: int, block: int, recording: Recording, others
 
 
 def _forms(means: Array, state: State, side: bool) -> Iterator[tuple[str, Array]]:
-    """The forms of a channel's `means` [n], a side channel's or another axis'; none of one that is constant."""
+    """The forms of a channel's `means` [n], a side channel's or another axis'; no form of a constant channel."""
     values, dt = bridged(np.where(np.isfinite(state.y), means, np.nan)), state.dt
     spread = float(values.std())
     if not (math.isfinite(spread) and spread > 0.0):

@@ -1,4 +1,4 @@
-"""One axis of a recording by one engine: the posterior of every law, and the evidence against the likeliest."""
+"""An axis of a recording by an engine: the posterior of every law, and the evidence against the likeliest."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from selfcal.readings.rest import outside_priors
 
 
 def with_reasons(axes: dict[str, Identified | UserError], recording: Recording, model: Model) -> None:
-    """Give the axes outside the priors their reason: one for all of them."""
+    """Give the axes outside the priors a common reason."""
     outside = [name for name, axis in axes.items() if isinstance(axis, OutsidePriors)]
     if outside:
         reason = UserError(outside_priors(recording, model, outside))
@@ -62,9 +62,9 @@ def identify_axis(
     *,
     draw: bool = False,
 ) -> Identified:
-    """One axis by one engine. The record is fed as float32, as the firmware gets it; less a nominal offset where that
-    is too coarse. Wrong readings are left out (`readings.py`). With regressors every subset of them is scored;
-    `advance` is called after each. `draw`: with the Allan deviation of the samples."""
+    """An axis by an engine. The record is fed as float32, as the firmware gets it; less a nominal offset where that is
+    too coarse. Wrong readings are left out (`readings.py`). With regressors every subset of them is scored; `advance`
+    is called after each. `draw`: with the Allan deviation of the samples."""
     recording = recording.along(name)
     fed = _fed(recording, name, model, decimate)
     if engine == "reference":

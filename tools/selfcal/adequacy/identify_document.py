@@ -29,10 +29,10 @@ EPOCH_S = (1e9, 4.1e9)
 
 @dataclass(frozen=True)
 class Identified:
-    """One axis: the engine's `result` in `unit`, what was `judged` of its adequacy, the samples `kept_out`, and what is
-    known of the regressors, if the model has any for it (coefficients in `unit` too). `sampled`: the Allan deviation of
-    its samples, if it was asked for; as the curve of `judged` it is in the `group_unit`, and so are the numbers of the
-    `summary`. `halved_after`: see summary.py. `more_laws`: probabilities of the laws where the drift is 1/f noise."""
+    """An axis: the engine's `result` in `unit`, what was `judged` of its adequacy, the samples `kept_out`, and the
+    regressors that are `scored`, if any (coefficients in `unit` too). `sampled`: the Allan deviation of its samples, if
+    it was asked for; as the curve of `judged` it is in the `group_unit`, and so are the numbers of the `summary`.
+    `halved_after`: see summary.py. `more_laws`: probabilities of the laws where the drift is 1/f noise."""
 
     unit: str
     group_unit: str

@@ -1,8 +1,8 @@
 """1/f noise as a law next to the laws of a model: how likely it is, its B, and the white noise next to it.
 
-The law `flicker` has three terms, so 1/f noise above the fastest one looks white to it: its N is too large. White noise
-next to 1/f noise is what the law's spectrum has more than B^2 / (2 pi f) at a third of the bank's rate. There the two
-agree best on records of 10 minutes to 4 hours (tests/noise_coverage.py).
+The law `flicker` has three terms, so 1/f noise above the fastest term looks white to it: its N is too large. White
+noise next to 1/f noise is what the law's spectrum has more than B^2 / (2 pi f) at a third of the bank's rate. There the
+two agree best on records of 10 minutes to 4 hours (tests/noise_coverage.py).
 
 The paper's laws put the Allan deviation's minimum of true 1/f noise 10 to 40 % too high. So the data sheet's numbers
 weigh the law `flicker` with the model's laws.
@@ -68,8 +68,8 @@ def beside_its_law(parameters: Mapping[str, float], dt_s: float, block: int) -> 
 
 
 def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> AxisResult:
-    """The same with N of the law `flicker` next to 1/f noise. The result is unchanged without that law, or where the
-    record is too short for it."""
+    """The `result` with N of the law `flicker` next to 1/f noise. The result is unchanged without that law, or where
+    the record is too short for it."""
     estimates = result.parameters.get(FLICKER, {})
     medians = {name: estimate.median for name, estimate in estimates.items()}
     if not estimates or n < 2 * AVERAGES_LEAST or not all(math.isfinite(value) for value in medians.values()):
@@ -86,7 +86,7 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
 @dataclass(frozen=True)
 class AddedLaw:
     """A `law` added to a model's laws: its probability among them, and its posterior of `n` means over `block` samples,
-    one every `dt_s`, under the priors of `group`."""
+    every `dt_s`, under the priors of `group`."""
 
     probability: float
     estimates: Mapping[str, Estimate]
@@ -97,7 +97,7 @@ class AddedLaw:
     law: str = FLICKER
 
     def laws(self, probability: Mapping[str, float]) -> dict[str, float]:
-        """The probabilities of all laws where this one is sure; else none."""
+        """The probabilities of all laws where this law is sure; else empty."""
         if self.probability < SURE_PROBABILITY:
             return {}
         return {**{law: (1.0 - self.probability) * p for law, p in probability.items()}, self.law: self.probability}
@@ -105,7 +105,7 @@ class AddedLaw:
 
 @dataclass(frozen=True)
 class Rerun:
-    """What an engine takes of the one axis of `tables`, for another law: `samples` [n] less `offset` (see Bank) after
+    """Input of an engine for the only axis of `tables`, for another law. `samples` [n] less `offset` (see Bank) after
     `missing_before` [n], and `columns` [n, p] of which those of `mask` are in use."""
 
     tables: Tables

@@ -21,12 +21,12 @@ from selfcal.base.grid import Array
 
 def upper_limit(deviation: Array, freedom: Array, level: float) -> Array:
     """Upper limits [t] of the true Allan deviations with the probability `level`, each: measured `deviation` [t] with
-    so many degrees of `freedom` [t], its square distributed as chi-square over them."""
+    `freedom` [t] degrees of freedom, its square distributed as chi-square over them."""
     return np.asarray(deviation * np.sqrt(freedom / chdtri(freedom, level)))
 
 
 def overbound(tau_s: Sequence[Array], limit: Sequence[Array]) -> tuple[float, float]:
-    """N and K of the least area above all curves, one an axis: `limit` [t] at `tau_s` [t]. NaN without a point."""
+    """N and K of the least area above the curves of all axes: `limit` [t] at `tau_s` [t]. NaN without a point."""
     tau, square = np.concatenate([*tau_s, []]), np.concatenate([*limit, []]) ** 2
     if tau.size == 0:
         return math.nan, math.nan

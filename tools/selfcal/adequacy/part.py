@@ -43,7 +43,7 @@ LEAST_BIAS = 1000.0
 
 @dataclass(frozen=True)
 class Stated:
-    """One number of a data sheet: `of` a group or an axis, "" for all that it fits, with its `unit`."""
+    """A number of a data sheet: `of` a group or an axis, "" for all that it fits, with its `unit`."""
 
     of: str
     key: str
@@ -53,7 +53,7 @@ class Stated:
 
 
 def parse_stated(text: str) -> Stated:
-    """`gx.N=0.012deg/sqrt(h)`: an axis or a group and a dot, if it is of one alone; the key; the number; its unit."""
+    """`gx.N=0.012deg/sqrt(h)`: an axis or a group and a dot, if it is of these alone; the key; the number; its unit."""
     match = re.fullmatch(r"\s*(?:(?P<of>[\w-]+)\.)?(?P<key>\w+)\s*=(?P<quantity>.*)", text)
     wanted = "write KEY=NUMBER and its unit, as N=0.012deg/sqrt(h), accel.N=70ug/sqrt(Hz) or rate=200Hz"
     if match is None:
@@ -74,7 +74,7 @@ def parse_stated(text: str) -> Stated:
 
 
 def groups(default: Mapping[str, Any], recording: Recording, axes: Sequence[str]) -> dict[str, Any]:
-    """The trees of the groups that the recording's axes make: those of the default model where it has them, else one
+    """The trees of the groups that the recording's axes make: those of the default model where it has them, else a tree
     for each kind and unit, whose priors are laid later."""
     trees: dict[str, Any] = {}
     for axis in (column for column in recording.columns if column in SENSORS or column in axes):
@@ -163,7 +163,7 @@ def put_read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Read
         if not own:
             continue
         steps = [step for axis in own if (step := _step(axis)) > 0.0]
-        # Means of a lattice lie on a finer one, which may show or not.
+        # Means of a lattice lie on a finer lattice, which may show or not.
         if not averaged or (steps and not _divides(min(steps), group.lsb)):
             fields["lsb"] = float(f"{min(steps, default=0.0):.6g}")
         if not stated and any(axis.lattice is not None and axis.lattice.too_coarse for axis in own):
@@ -178,12 +178,12 @@ def put_read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Read
 
 
 def _step(readings: Readings) -> float:
-    """The lattice of an axis, that of a fine one too; 0 for none."""
+    """The step of an axis' lattice, however fine; 0 without a lattice."""
     return readings.lattice.step if readings.lattice is not None else step_of(_known(readings))[0]
 
 
 def _divides(step: float, lsb: float) -> bool:
-    """Whether a lattice is that of means of readings on a coarser one."""
+    """Whether a lattice is of means of readings on a coarser lattice."""
     return abs(lsb / step - round(lsb / step)) < 0.002 * lsb / step
 
 
@@ -253,7 +253,7 @@ def _put(group: dict[str, Any], number: Stated, axis: str, measured: bool) -> No
     elif number.key == "bias":
         held["bias"] = {"law": "normal", "sd": rounded(value)}
     else:
-        # A data sheet's bias instability is the size of the slow drift: the deviation of a Gauss-Markov one.
+        # A data sheet's bias instability is the size of the slow drift: the deviation of a Gauss-Markov drift.
         name = "sigma_m" if number.key == "B" else number.key
         half = math.sqrt(before[name].max / before[name].min)
         held[name] = prior_tree(Prior("log_uniform", min=rounded(value / half), max=rounded(value * half)))

@@ -48,7 +48,7 @@ ONE_OVER_F = "the drift is 1/f noise"
 
 @dataclass(frozen=True)
 class SheetNumber:
-    """One of the numbers. `reason`: why it is not identified, else ""; its 95 % quantile is then an upper limit."""
+    """A number. `reason`: why it is not identified, else ""; its 95 % quantile is then an upper limit."""
 
     estimate: Estimate
     reason: str = ""
@@ -122,7 +122,7 @@ def summarize(
     ):
         why = WIDE
     if why:
-        # Its limit holds if there is a walk, however little a law with one counts.
+        # Its limit holds if there is a walk, however little a law with a walk counts.
         ends = [estimates["K"].q95 for estimates in result.parameters.values() if "K" in estimates]
         most = [end for end in ends if math.isfinite(end)]
         if (w_walk * walk > 0.0).any():
@@ -154,7 +154,7 @@ def _draws(beside: AddedLaw) -> tuple[Array, Array, Array, Array, Array]:
     else:
         lowest = [_minimum(terms, m) for terms in fit.drawn(draws)]
         white, (floor, side) = draws["N"], np.array(lowest, dtype=float).T
-    # A Gauss-Markov drift is like a walk. Noise without a memory, or with one of the other sign, has no Q.
+    # A Gauss-Markov drift is like a walk. Noise without a memory, or with a memory of the other sign, has no Q.
     none = np.zeros(white.size)
     walk = draws.get("K", draws.get("sigma_m", none) * np.sqrt(2.0 * draws.get("alpha", none)))
     over = np.maximum(draws.get(COLOURED, none + 1.0) ** -2.0 - 1.0, 0.0)

@@ -1,1 +1,1 @@
-"""The engines behind one interface, their block means and results."""
+"""The engines behind a common interface, their block means and results."""

@@ -17,7 +17,7 @@ from selfcal.model.file import Group, Model
 from selfcal.model.tables import Tables, make_tables
 from selfcal.readings.readings import mostly_beyond
 
-#: Intervals of an even grid, gaps included, that are computed one by one.
+#: Intervals of an even grid, gaps included, that are computed singly.
 MOST_DENSE = 10_000_000
 #: Fewest bank samples that are checked.
 BLOCKS_LEAST = 20
@@ -28,10 +28,9 @@ class Blocks:
     """Block means of a record for the reference and the checks.
 
     `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
-    those used; `kept_out` counts the samples that were not used, by reason; `z` [m, p] are the means of the
-    regressors' columns. `after`: samples from the last whole block to the last usable sample, missing ones included.
-    `begin`: sample instants from the record's first one to the first block. Blocks beyond MOST_DENSE intervals are not
-    worked out.
+    those used; `kept_out` counts the samples that were not used, by reason; `z` [m, p] are the means of the regressors'
+    columns. `after`: samples from the last whole block to the last usable sample, missing ones included. `begin`:
+    sample instants from the record's first to the first block. Blocks beyond MOST_DENSE intervals are not worked out.
     """
 
     mean: Array

@@ -67,8 +67,8 @@ class Bank:
         missing_before: NDArray[np.integer[Any]] | None = None,
         regressors: NDArray[np.floating[Any]] | None = None,
     ) -> None:
-        """Feed `samples` [n, axes] in the model's units, after `missing_before` [n] missing ones each, with the values
-        of the `regressors` [n, p] if the tables have any."""
+        """Feed `samples` [n, axes] in the model's units, after `missing_before` [n] missing samples each, with the
+        values of the `regressors` [n, p] if the tables have any."""
         rows = np.ascontiguousarray(samples, dtype=np.float32)
         missing = np.zeros(len(rows)) if missing_before is None else missing_before
         values = None if regressors is None else np.ascontiguousarray(regressors, dtype=np.float32)

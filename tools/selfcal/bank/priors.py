@@ -1,7 +1,7 @@
 """Priors of an axis whose recording lies outside the model's: limits that are laid about the recording itself.
 
-A record within the limits keeps the model's priors. So does one that moved: its readings show motion, not the sensor.
-The limits depend on the recording and the model alone, so that every verb and every target has the same.
+A record within the limits keeps the model's priors. So does a record that moved: its readings show motion, not the
+sensor. The limits depend on the recording and the model alone, so that every verb and every target has the same.
 
 First N, the drift and the level are compared with the limits by Allan deviations. Then a bank shows on which ends the
 posteriors of the laws lean (`leaning`): a walk below the least K has no other sign. Those limits move along.
@@ -30,8 +30,8 @@ from selfcal.readings.rest import PIECES_LEAST, rest_of
 
 #: Factor of the own prior of N to each side of the record's N.
 DECADES = 100.0
-#: Narrowest range of N, a factor, that is replaced: a narrower one is knowledge of the part (warm start, own model). An
-#: axis with so many times the N of its group has priors of its own.
+#: Narrowest range of N, a factor, that is replaced: a narrower range is knowledge of the part (warm start, own model).
+#: An axis with this many times the N of its group has priors of its own.
 NARROW = math.sqrt(DECADES)
 #: Level over the sd of the own bias prior.
 LEVEL_SD = 2.0
@@ -213,7 +213,7 @@ def laid(
     sd = priors["bias"].sd
     if abs(level) > CHECK_LIMIT * sd:
         sd = rounded(LEVEL_SD * abs(level))
-    # A bias prior may be so much wider than the least N: first it gives way, then N.
+    # A bias prior may be WIDEST_BIAS times the least N: first it gives way, then N.
     sd = max(min(sd, WIDEST_BIAS * N / DECADES), rounded(abs(level) / LEVEL_SD))
     least = max(N / DECADES, rounded(1.01 * sd / WIDEST_BIAS))
     own = {"bias": Prior("normal", sd=sd), "N": _limits(priors["N"].law, least, DECADES * N)}
@@ -230,7 +230,7 @@ def moved_along(
     """The `priors` of an axis with the limits moved that a posterior leans on. As they are where none does, or where no
     law gains by it.
 
-    The laws are those of one drift term, without regressors, on the means of MOST_INTERVALS intervals at most."""
+    The laws are those of a single drift term, without regressors, on the means of MOST_INTERVALS intervals at most."""
     recording = recording.along(name)
     length_s = recording.duration_s
     size = UNSEEN * seen.N / math.sqrt(length_s)
@@ -268,7 +268,7 @@ def moved_along(
 
 
 def leaning(result: AxisResult, priors: Mapping[str, Prior]) -> dict[str, int]:
-    """The parameters whose posterior under a law leans on an end of its prior: -1 the lower, 1 the upper one."""
+    """The parameters whose posterior under a law leans on an end of its prior: -1 the lower, 1 the upper."""
     ends: dict[str, int] = {}
     for estimates in result.parameters.values():
         for key, estimate in estimates.items():
@@ -290,7 +290,7 @@ def leaning(result: AxisResult, priors: Mapping[str, Prior]) -> dict[str, int]:
 
 def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> bool:
     """Whether limits `moved` are the record's own: a law that counts gains by them. Of a law whose alpha moved the sum
-    of all laws must gain: as alpha falls it becomes a walk, which may be one of them."""
+    of all laws must gain: as alpha falls it becomes a walk, which may be among them."""
     gain = {law: second.log_evidence[law] - before for law, before in first.log_evidence.items()}
     whole = [float(np.logaddexp.reduce(list(result.log_evidence.values()))) for result in (first, second)]
     return whole[1] > whole[0] + CLEARLY or any(

@@ -229,8 +229,7 @@ def _modes(value: Callable[[Array], Array], low: Array, high: Array) -> Array:
 
 
 def _widths(value: Callable[[Array], Array], mode: Array, low: Array, high: Array) -> Array:
-    """Distance in each direction at which `value` has fallen by half a nat: one conditional sd of a normal
-    posterior."""
+    """Distance in each direction at which `value` has fallen by half a nat: a conditional sd of a normal posterior."""
     reach = 2.0 ** np.arange(-40, 1)
     widths = high - low
     for d in range(len(mode)):
@@ -277,8 +276,8 @@ class _Lattice:
         self._spread()
 
     def _spread(self) -> None:
-        """Filter every node next to one above the depth. A turn looks next to the nodes that the last turn added: all
-        nodes next to older ones are there."""
+        """Filter every node next to a node above the depth. A turn looks next to the nodes that the last turn added:
+        all nodes next to older nodes are there."""
         directions = np.eye(len(self.low), dtype=np.int64)
         known = set(self._key(self.index).tolist())
         first = 0

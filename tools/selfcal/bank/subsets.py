@@ -59,7 +59,7 @@ class ScoredSubsets:
 def combine(
     choices: Sequence[Choice], results: Sequence[AxisResult], hypotheses: Mapping[str, float], unit: str
 ) -> ScoredSubsets:
-    """Weigh the subsets by their evidence; `unit` is that of the axis. At least one must have evidence."""
+    """Weigh the subsets by their evidence; `unit` is that of the axis. At least one subset must have evidence."""
     from scipy.special import logsumexp
 
     ln_before = np.array([ln_prior(choices[-1], choice) for choice in choices])

@@ -31,7 +31,7 @@ _AGAIN_S = 0.02
 
 
 class HeldSignals:
-    """The signal that came while signals are held: whether it has asked for the end. One for the process."""
+    """The signal that came while signals are held: whether it has asked for the end. Shared by the process."""
 
     holding = False
     came: int | None = None
@@ -58,7 +58,7 @@ class HeldSignals:
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
     if HeldSignals.holding and HeldSignals.came is None:
-        HeldSignals.came, HeldSignals.came_at = number, time.monotonic()  # a second one ends at once, whatever is held
+        HeldSignals.came, HeldSignals.came_at = number, time.monotonic()  # a second signal ends at once
         return
     if _imports(frame):
         signal.signal(signal.SIGALRM, lambda _, later: _on_signal(number, later))
@@ -101,7 +101,7 @@ def leave(code: int) -> NoReturn:
 
 
 def install_signals() -> None:
-    """Have the signals raise Ended. One that is ignored stays so: `nohup`, a shell's background job."""
+    """Have the signals raise Ended. An ignored signal stays so: `nohup`, a shell's background job."""
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _on_signal)

@@ -1,4 +1,4 @@
-"""The one error type users see, and how text of unknown origin is shown."""
+"""The only error type users see, and how text of unknown origin is shown."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def cell(text: str) -> str:
 
 
 def short(text: str, most: int = 60) -> str:
-    """At most so many printable characters of something found in a file."""
+    """At most `most` printable characters of something found in a file."""
     clean = "".join(letter if letter.isprintable() else "?" for letter in text[: most + 1])
     return clean if len(clean) <= most else clean[: most - 3] + "..."
 
@@ -77,7 +77,7 @@ def short_value(value: object) -> str:
 
 
 def install_line(what: str) -> str:
-    """The line to type for a package that is not installed with this one: its name, or `selfcal[extra]`."""
+    """The line to type for a package that is not installed with this package: its name, or `selfcal[extra]`."""
     return f"{shlex.quote(sys.executable)} -m pip install {shlex.quote(what)}"
 
 

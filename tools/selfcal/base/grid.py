@@ -31,7 +31,7 @@ def bisected(holds: Callable[[float], bool], low: float, high: float) -> tuple[f
 
 
 def slices(sizes: Sequence[int]) -> list[slice]:
-    """Slices of so many entries each, one behind the other."""
+    """Slices of `sizes` entries each, back to back."""
     return list(starmap(slice, pairwise(accumulate(sizes, initial=0))))
 
 
@@ -55,7 +55,7 @@ def equal_runs(values: NDArray[np.floating[Any]]) -> tuple[Rows, Rows]:
 
 def counts_of_pieces(code: Rows, many: int, least: int, most: int) -> tuple[Rows, Rows]:
     """The piece [n] that each code is in, and how often a piece has each of `many` codes [pieces, many]. There are
-    `most` pieces at most, of `least` codes each at least; the last one has the rest too. n is `least` or more."""
+    `most` pieces at most, of `least` codes each at least; the last piece has the rest too. n is `least` or more."""
     size = max(least, -(-code.size // most))
     piece = np.minimum(np.arange(code.size) // size, code.size // size - 1)
     return piece, np.bincount(piece * many + code, minlength=(int(piece[-1]) + 1) * many).reshape(-1, many)

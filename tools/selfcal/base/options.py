@@ -12,7 +12,7 @@ from typing import Any
 
 from selfcal.base.errors import UserError
 
-#: Default of an option that must be typed, although the function has one.
+#: Default of an option that must be typed, although the function has a default.
 REQUIRED = Parameter.empty
 #: Size of one LSB, with its unit unless the column's usual one is meant.
 Scale = tuple[float, str | None]

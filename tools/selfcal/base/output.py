@@ -51,7 +51,7 @@ def whole(path: Path | str) -> Iterator[Path]:
 
 @contextmanager
 def together(path: Path | str, *others: Path | str) -> Iterator[tuple[Path, ...]]:
-    """The same for files that belong together: all are on the disk before the first takes its place.
+    """Like `whole`, for files that belong together: all are on the disk before the first takes its place.
 
     Older files of `others` are removed first, so that none is left of another `path`. If the block removes a temporary
     file, its target is removed too.
@@ -83,7 +83,7 @@ def together(path: Path | str, *others: Path | str) -> Iterator[tuple[Path, ...]
 
 @dataclass(frozen=True)
 class _Pending:
-    """A file on its way: written as `temporary`, to become `place`, with the permissions of an older one."""
+    """A file on its way: written as `temporary`, to become `place`, with the permissions of an older file."""
 
     temporary: Path
     place: Path
@@ -129,7 +129,7 @@ def write_text(path: Path | str, text: str) -> None:
 
 
 def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None] = ()) -> None:
-    """Raise UserError now, before the work, for a file that could not be written after it, that is one of the `inputs`,
+    """Raise UserError now, before the work, for a file that could not be written after it, that is among the `inputs`,
     or that is there twice. None and '-' are skipped."""
     taken = {Path(path).resolve() for path in inputs if path is not None}
     for file in files:

@@ -19,7 +19,7 @@ def bar() -> Progress:
 
 class Doing:
     """`with Doing("diagnose") as doing:`, then `doing.now("gx: round 2")` whenever the work changes, from any thread,
-    and `doing.tick()` from the main one."""
+    and `doing.tick()` from the main thread."""
 
     def __init__(self, verb: str, *columns: ProgressColumn, total: float | None = None) -> None:
         """`columns` of the bar, whose `said` is a field, and the `total` of the work. Of a `verb` "" no line is
@@ -36,7 +36,7 @@ class Doing:
         self.progress.update(self.task, description=text)
 
     def tick(self) -> None:
-        """Write a line if one is due."""
+        """Write a line if due."""
         self.tell(f"{self.text} ({time.monotonic() - self.began:.0f} s)")
 
     def tell(self, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Units: the one place where they are known, and the only conversions in the package.
+"""Units: the only place where they are known, and the only conversions in the package.
 
 A unit is written as a product of powers: `deg/s`, `m/s^2`, `deg/s/sqrt(Hz)`, `m/s/h^1.5`. Conventions of the noise
 parameters, continuous time and two-sided: N is the white noise density (the Allan deviation at 1 s), K the random-walk
@@ -72,7 +72,7 @@ _ATOMS: dict[str, tuple[_Dimension, float]] = {
     "Pa": (_dimension(pressure=1), 1.0),
     "bar": (_dimension(pressure=1), 1e5),
 }
-#: Prefixes, the atoms that take one, and a mass.
+#: Prefixes, the atoms that take no prefix, and a mass.
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1, "h": 1e2, "k": 1e3}
 _WHOLE, _MASS = ("1", "dph", "ft", "in", "min", "h", "day"), "kg"
 #: Zero of a temperature scale in K; counts only where the temperature itself is meant, not in `deg/s/degC`.
@@ -206,7 +206,7 @@ def parse(name: str) -> Unit:
 
 
 def known(name: str) -> bool:
-    """Whether `name` is a unit (LSB counts as one)."""
+    """Whether `name` is a unit (LSB counts)."""
     try:
         return name == LSB or parse(name) is not None
     except UserError:

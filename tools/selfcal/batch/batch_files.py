@@ -108,7 +108,7 @@ def digest(path: Path) -> str:
 
 
 def hashed(path: str) -> BatchSource:
-    """A recording with its hashes. One that cannot be read has none; its reading says why."""
+    """A recording with its hashes. An unreadable recording has no hashes; its reading says why."""
     log = Path(path)
     try:
         of_file = digest(log)

@@ -185,7 +185,7 @@ def _laws(devices: Mapping[str, Sequence[BatchUnit]]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class KnownAlone:
-    """A quantity, or its logarithm, by one recording alone: `y` with the error `s`."""
+    """A quantity, or its logarithm, by a single recording: `y` with the error `s`."""
 
     y: float
     s: float

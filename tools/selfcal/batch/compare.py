@@ -1,4 +1,4 @@
-"""`selfcal compare`: what changed between recordings of one part, beyond what each leaves open."""
+"""`selfcal compare`: what changed between recordings of a part, beyond what each leaves open."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from selfcal.diagnosis.events import parted
 from selfcal.readings.budget import FALSE_ALARM
 
 SCHEMA = "selfcal.compare/1"
-#: Least difference that counts, in standard deviations: one quantity in 1 / FALSE_ALARM exceeds it by chance.
+#: Least difference that counts, in standard deviations: chance exceeds it in FALSE_ALARM of the quantities.
 LIMIT = sd_off(math.log(FALSE_ALARM))
-#: Estimates that are sizes of a cause, the one that stands for it first; places in time belong to one recording alone.
+#: Estimates that are sizes of a cause, its main size first; places in time belong to a single recording.
 SIZES = ("coefficient", "slope", "amplitude", "frequency_hz", "B", "lag1", "ratio", "lsb", "limit")
 
 
 @dataclass
 class Compared:
-    """One axis: the `pairs` of recordings that could be compared, their `changes`, and why others could not."""
+    """An axis: the `pairs` of recordings that could be compared, their `changes`, and why others could not."""
 
     pairs: int = 0
     changes: list[dict[str, Any]] = field(default_factory=list)
@@ -53,7 +53,7 @@ def incomparable(verdicts: Mapping[str, Mapping[str, Any] | None]) -> str | None
 
 
 def verdict_of(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Any]:
-    """Verdict and causes of an axis of a recording, or why one of the two has no result."""
+    """Verdict and causes of an axis of a recording, or why either has no result."""
     error = diagnosed.get("error", identified.get("error"))
     if error is not None:
         return {"error": error}
@@ -104,8 +104,8 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
 
 
 def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Findings of one recording alone that matter there, and changes beyond the limit, a row each. A number that one of
-    the recordings does not identify counts by its interval, and the row has its upper limit."""
+    """Findings of a single recording that matter there, and changes beyond the limit, a row each. A number that either
+    recording does not identify counts by its interval, and the row has its upper limit."""
     rows: list[dict[str, Any]] = []
     for key in sorted(before.keys() | after.keys()):
         a, b = before.get(key), after.get(key)
@@ -135,8 +135,8 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
 def compared_of(
     seen: Sequence[tuple[str, Mapping[str, Mapping[str, Any]]]], verdicts: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Compared]:
-    """Each recording compared with the one before, by axis. `seen`: the recordings with the quantities of each axis;
-    `verdicts`: by recording and axis."""
+    """Each recording compared with the recording before, by axis. `seen`: the recordings with the quantities of each
+    axis; `verdicts`: by recording and axis."""
     compared = {name: Compared() for axes in verdicts.values() for name in axes}
     for (first, before), (second, after) in pairwise(seen):
         for name, axis in compared.items():

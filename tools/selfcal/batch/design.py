@@ -35,7 +35,7 @@ from selfcal.model.file import Model
 
 #: Number of stages of the register that makes the bits.
 STAGES = 9
-#: Records that a length is tried with, and ratio of the next length to one that was too short.
+#: Records that a length is tried with, and ratio of the next length to a length that was too short.
 TRIED_RECORDS, LENGTH_RATIO = 20, 1.2
 LAG = Structure("lag", ("gain",), ("lag_s",))
 
@@ -127,7 +127,7 @@ def designed(
 
 
 def drawn_rows(model: Model, axis: str, experiment: Experiment, bit_s: float, samples: int, seed: int) -> list[Row]:
-    """Half the 90 % intervals of gain and lag of one drawn record, each over its size; infinite where it has none."""
+    """Half the 90 % intervals of gain and lag of a drawn record, each over its size; infinite without an interval."""
     dt = 1.0 / model.bank_rate_hz
     law, truth = part_of(model, axis, seed)
     y, _ = simulate_bank_samples(model.laws[law], truth, model.bank_rate_hz, samples, seed)

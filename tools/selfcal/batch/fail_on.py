@@ -10,7 +10,7 @@ from selfcal.base.ending import HeldSignals
 from selfcal.base.errors import UserError, note
 from selfcal.batch.verdicts import PASS, Verdict, code_of, worst
 
-#: Words for any finding that is unexplained or material, for a material one, and for a change between two recordings.
+#: Words: any unexplained or material finding, a material finding, and a change between two recordings.
 INADEQUATE, MATERIAL, CHANGED = "inadequate", "material", "changed"
 
 
@@ -43,7 +43,7 @@ def outcome(document: Mapping[str, Any], wanted: str) -> BatchOutcome:
 
 
 def _judged(document: Mapping[str, Any], wanted: str) -> Iterator[tuple[bool, str]]:
-    """Of each axis whether it applies, and if not, why that is not known ("": it is)."""
+    """For each axis, whether `wanted` applies, and why that is not known ("": it is)."""
     if "verdicts" in document:
         for name, axis in document["axes"].items():
             apart = isinstance(axis, Mapping)  # not all recordings could be compared

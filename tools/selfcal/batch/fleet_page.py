@@ -1,4 +1,4 @@
-"""The page of `selfcal fleet --report`: one file that loads nothing, at most 1 MB however many units there are."""
+"""The page of `selfcal fleet --report`: a file that loads nothing, at most 1 MB however many units there are."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """`selfcal plan`: how long must a part be recorded, and at what rate, until what is wanted of it is known?
 
 An ensemble answers: parts as the model file's `simulate` entry states them, what it leaves open drawn from the priors.
-Each is recorded for longer and longer, by readings at the bank's rate, and
-identified. The length is the one at which SHARE of the records have what is
-wanted. The Fisher information of the spectrum says how that length changes with the rate.
+Each is recorded for longer and longer, by readings at the bank's rate, and identified. The length is where SHARE of the
+records have what is wanted. The Fisher information of the spectrum says how that length changes with the rate.
 
 A wish of a regressor's coefficient asks for a swing of its channel in a record of that length. The channel follows a
 cosine of half a cycle (one sweep) or more. The column that it makes, of variance V over n readings, says n V / S of the
@@ -57,7 +56,7 @@ _SHARE, _VALUE = re.compile(rf"(\w+) within {_NUMBER} ?%"), re.compile(rf"(\w+) 
 
 @dataclass(frozen=True)
 class Wish:
-    """What is wanted: a metric of at most `most`. Of the law (`parameter` ""): 1 - P of the true one. Of a parameter,
+    """What is wanted: a metric of at most `most`. Of the law (`parameter` ""): 1 - P of the true law. Of a parameter,
     or a regressor's coefficient: half its 90 % interval, over its median if `unit` is ""."""
 
     text: str
@@ -118,8 +117,8 @@ def column_of(regressor: Regressor, channel: Array, rate_hz: float) -> Array:
 
 
 def bracket(lacks: Callable[[int], bool], least: int) -> tuple[int, int | None]:
-    """The bank samples of the longest record tried that lacks something, 0 for none, and of a shortest one that has it:
-    longer by LENGTHS_ALIKE at most, None beyond LENGTH_MOST."""
+    """The bank samples of the longest record tried that lacks something, 0 for none, and of a shortest record that has
+    it. The latter is longer by LENGTHS_ALIKE at most, None beyond LENGTH_MOST."""
     low, high = 0, least
     while lacks(high):
         low, high = high, 2 * high
@@ -201,7 +200,7 @@ def cycling(
     bare, sweeps = replace(model, regressors=()), []
     parts = [part_of(bare, axis, seed) for seed in seeds]
     needed = (HALF_90 / wish.most) ** 2 - regressor.sd[model.group_of(axis).name] ** -2
-    # One sweep is half a cycle.
+    # A sweep is half a cycle.
     for cycles in (0.5, 1.0, 4.0):
         omega = np.array([2.0 * math.pi * cycles / samples])
         one_swing = column_of(regressor, swung(samples, cycles, 1.0), model.bank_rate_hz)
@@ -216,7 +215,7 @@ def cycling(
                 seeds,
                 scheduler=scheduler,
             )
-            # The information of a swing is as its square: each record's own swing by the one that it had.
+            # The information of a swing is as its square: each record's own swing by the swing that it had.
             own = [(HALF_90 / row["half"]) ** 2 - regressor.sd[model.group_of(axis).name] ** -2 for row in rows]
             swing *= math.sqrt(needed / float(np.quantile(own, 1.0 - SHARE)))
         sweeps.append({"cycles": cycles, "period_s": samples / model.bank_rate_hz / cycles, "swing": swing})
@@ -256,7 +255,7 @@ def part_of(model: Model, axis: str, seed: int) -> tuple[str, dict[str, float]]:
 
 
 def rows_of(model: Model, axis: str, wishes: Sequence[Wish], samples: int, seed: int) -> list[Row]:
-    """One record of the part: its law, truth, and the metric of each wish."""
+    """A record of the part: its law, truth, and the metric of each wish."""
     from selfcal.bank.library import Bank
 
     law, truth = part_of(model, axis, seed)
@@ -305,7 +304,7 @@ def rates(
 
 
 def _times(half: Callable[[float, float], float], own_hz: float, rate_hz: float, duration_s: float) -> float:
-    """Length at another rate over this one for an equal interval, within MOST_TIMES; 0 without an interval."""
+    """Length at another rate over this length for an equal interval, within MOST_TIMES; 0 without an interval."""
     target, far = half(own_hz, duration_s), math.log(MOST_TIMES)
     if target == math.inf:
         return 0.0
@@ -338,7 +337,7 @@ def steady_level(curve: Sequence[Mapping[str, float]]) -> float | None:
 
 
 def _swings(wish: Mapping[str, Any]) -> str:
-    """By how much to change the channel: once, or to and fro."""
+    """How much to change the channel: once, or to and fro."""
     once, _, often = wish["cycling"]
     if once["swing"] == 0.0:
         return f"the prior has it: {wish['channel']} may stay as it is"

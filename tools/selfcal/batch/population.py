@@ -6,13 +6,13 @@ mean m and spread t. Its recording measures x with the error that its own poster
     y | x ~ N(x, s^2)      x ~ N(m + group, t^2)
 
 m has a flat prior and is integrated out in closed form. t has Jeffreys' prior, t sqrt(sum (t^2 + s^2)^-2), on a grid.
-So a few units give tails as Student's: "far off" means the same in a batch of 5 as in one of 500.
-Odd units are found by the generalized test of extremes (Rosner, Technometrics 25, 1983): the k that are farthest from
-the median are odd if the nearest of them is unlike the population of all others. So several odd units do not hide each
-other. A unit that is odd in one quantity of an axis counts in another one of the axis only where it is ordinary.
-A group is a station, a day or a lot whose units all differ by one amount: the group's own, not the parts'. Of two
-groups alone nobody can say which is off: each is then half the difference away from the mean. Two groups need no label
-where two normals fit the units better than one.
+So a few units give tails as Student's: "far off" means the same in a batch of 5 as in a batch of 500. Odd units are
+found by the generalized test of extremes (Rosner, Technometrics 25, 1983): the k that are farthest from the median are
+odd if the nearest of them is unlike the population of all others. So several odd units do not hide each other. A unit
+that is odd in one quantity of an axis counts in another quantity of the axis only where it is ordinary. A group is a
+station, a day or a lot whose units all differ by one amount: the group's own, not the parts'. Of two groups alone
+nobody can say which is off: each is then half the difference away from the mean. Two groups need no label where two
+normals fit the units better than one.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ _POINTS, _SPREAD_LEAST, _SPREAD_MOST = 160, 1e-3, 100.0
 FALSE_NAME = 0.03
 #: Largest share of odd units, and the most numbers of odd units that are tried.
 MOST_ODD, _TRIED = 1.0 / 3.0, 40
-#: Evidence of two groups over one, nats: normal batches of 8 to 24 units exceed it as if the second mean, the share and
-#: the cut were three numbers more.
+#: Evidence of two groups over a single group, nats. Normal batches of 8 to 24 units exceed it as if the second mean,
+#: the share and the cut were three numbers more.
 _SPLIT = 0.5 * float(chdtri(3, FALSE_ALARM))
 
 
 @dataclass(frozen=True)
 class Measured:
-    """One quantity over the units that have it: `y` and `s` [n], the places of the units among all, and whether y is a
+    """A quantity over the units that have it: `y` and `s` [n], the places of the units among all, and whether y is a
     logarithm."""
 
     name: str
@@ -111,7 +111,7 @@ def fit_population(y: Array, s: Array) -> PopulationFit:
 
 def _on_grid(y: Array, s: Array, sides: Mask) -> tuple[Array, Array, Array, Array]:
     """Spreads [p] and their weights [p], with the mean of each side and its variance [sides, p]. Each unit is on one of
-    the `sides` [sides, n], which have one spread."""
+    the `sides` [sides, n], which share a spread."""
     errors = s**2
     residual = y - sum(side * y[side].mean() for side in sides)
     scale = math.sqrt(float(residual @ residual) / (y.size - len(sides)) + float(np.median(errors)))
@@ -135,7 +135,7 @@ def _tail(weight: Array, off: Array) -> Array:
 class Apart:
     """A group whose units all differ: `kind` (station, day, lot) and its `name`; by `offset` (of ln y, or of y).
 
-    `against`: the name of the only other group, "" for units without one; None: the others are of several groups.
+    `against`: the name of the only other group, "" for units without a label; None: the others are of several groups.
     `also`: groups of other kinds that have the same units. `members`: the places of its units among all."""
 
     kind: str
@@ -148,7 +148,7 @@ class Apart:
     against: str | None = None
 
     def shift(self, devices: NDArray[np.intp]) -> Array:
-        """By how much the units at the places `devices` [n] are off for it."""
+        """Offset of the units at the places `devices` [n] by this group."""
         inside = np.isin(devices, self.members)
         return self.offset * (inside.astype(np.float64) - (0.0 if self.against is None else 0.5))
 
@@ -165,9 +165,9 @@ class Unlike:
 
 @dataclass(frozen=True)
 class Population:
-    """One quantity of the batch. `apart`: groups that differ. `unlike`: units that are not of it. `kept` [n]: whether a
-    unit counts in it; one that is unlike, in this quantity or another of the axis, does not.
-    `offset` [n] of each unit by its groups. `seen_from`: how far off a unit with the usual error is unlike."""
+    """A quantity of the batch. `apart`: groups that differ. `unlike`: units that are not of it. `kept` [n]: whether a
+    unit counts in it; a unit that is unlike, in this quantity or another of the axis, does not. `offset` [n] of each
+    unit by its groups. `seen_from`: how far off a unit with the usual error is unlike."""
 
     measured: Measured
     fit: PopulationFit
@@ -178,7 +178,7 @@ class Population:
     unlike: tuple[Unlike, ...] = field(default=())
 
     def shrunken(self, k: int) -> Interval:
-        """The estimate of the quantity's k-th unit by the whole batch. One that is left out keeps its own."""
+        """The estimate of the quantity's k-th unit by the whole batch. A unit that is left out keeps its own."""
         y, s = float(self.measured.y[k]), float(self.measured.s[k])
         if not self.kept[k]:
             return Interval(y, y - HALF_90 * s, y + HALF_90 * s)
@@ -316,7 +316,7 @@ def _kept(y: Array, s: Array, limit: float) -> Mask:
 def _split(measured: Measured, y: Array, kept: Mask) -> Apart | None:
     """The smaller of two groups in which the units lie, if two are better than a single group by _SPLIT.
 
-    Each cut of the sorted units gives two normals of one spread. Their likelihood counts each unit's group as drawn."""
+    Each cut of the sorted units gives two normals, equally wide. Their likelihood counts each unit's group as drawn."""
     order = np.flatnonzero(kept)[np.argsort(y[kept])]
     x, s, n = y[order] - y[kept].mean(), measured.s[order], order.size
     if n < 2 * GROUP_UNITS_LEAST:
@@ -344,8 +344,8 @@ def _split(measured: Measured, y: Array, kept: Mask) -> Apart | None:
 
 
 def _most_apart(measured: Measured, y: Array, groups: Groups, limit: float, group_limit: float) -> Apart | None:
-    """The group that differs most from the others, None without one beyond ln probability `group_limit`. `y` [n]: the
-    units without the groups that are known.
+    """The group that differs most from the others, None if no group is beyond ln probability `group_limit`. `y` [n]:
+    the units without the groups that are known.
 
     Medians, which a few odd units move little, choose; the exact test of the units without odd ones decides. Medians
     see less: half the logarithm of the probability makes a candidate."""
@@ -376,7 +376,7 @@ def _by_medians(y: Array, s: Array, inside: Mask) -> float:
 
 
 def _difference(y: Array, s: Array, inside: Mask, limit: float) -> tuple[float, float]:
-    """By how much the units `inside` [n] differ from the others, and ln of the probability that chance does it.
+    """Difference of the units `inside` [n] from the others, and ln of its probability by chance.
 
     Units that are odd on their own side count on neither."""
     side_of = np.where(inside, np.median(y[inside]), np.median(y[~inside]))

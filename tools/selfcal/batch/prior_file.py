@@ -80,7 +80,7 @@ def _prior(population: Population) -> Prior:
 
 
 def _of_lots(population: Population) -> np.ndarray:
-    """By how much each unit [n] is off for its lot, or for the one of two groups: its own, unlike a station's part."""
+    """Offset of each unit [n] by its lot, or by its side of two groups: its own, unlike a station's part."""
     shift = np.zeros(population.measured.at.size)
     for apart in population.apart:
         if apart.kind in ("lot", TWO_GROUPS) or any(name.startswith("lot ") for name in apart.also):
@@ -89,8 +89,8 @@ def _of_lots(population: Population) -> np.ndarray:
 
 
 def _odds(model: Model, batch: Batch) -> dict[str, float]:
-    """Prior odds of each law, the mean over the model's axes: of one in the batch the share of the units, one more of
-    each law among them; of any other the model's."""
+    """Prior odds of each law, the mean over the model's axes. An axis in the batch has the share of the units, and a
+    unit more of each law. Any other axis has the model's odds."""
     there = set(axes_of(batch.devices))
     total = dict.fromkeys(model.hypotheses, 0.0)
     for axis in model.axes:

@@ -113,8 +113,8 @@ def spread(
     `scheduler`: address of a Dask scheduler, whose workers have this package. `results`: the folder that keeps finished
     jobs; `settings`: as `Kept` has them. `count`: workers here, by default as many as processors. `lost`: the rows of a
     job whose workers die; without it such a job ends the work. `weights` [jobs]: the work of each, for the remaining
-    time. `verb`: who writes the progress on stderr where there is no terminal; "": nobody.
-    Raises UserError for a package that is absent and a scheduler that does not answer.
+    time. `verb`: who writes the progress on stderr without a terminal; "": nobody. Raises UserError for a package that
+    is absent and a scheduler that does not answer.
     """
     if count is not None and count < 1:
         raise UserError("--workers must be at least 1")
@@ -145,7 +145,7 @@ class _Remaining(Doing):
         self.weights, self.left, self.worked, self.jobs = weights, sum(weights), 0.0, 0
 
     def done(self, jobs: Iterable[int]) -> None:
-        """These were done by an earlier run."""
+        """Count jobs that an earlier run did."""
         for k in jobs:
             self.left -= self.weights[k]
             self.jobs += 1
@@ -200,7 +200,7 @@ def _here(
     count: int | None,
     lost: Callable[[Job], list[Row]] | None,
 ) -> Iterator[tuple[int, list[Row]]]:
-    """Each worker is a pool of its own: a dead one leaves the others at their work, and its own job is known."""
+    """Each worker is a pool of its own: a dead worker leaves the others at their work, and its own job is known."""
     queue, deaths = deque(waiting), dict.fromkeys(waiting, 0)
     with ExitStack() as stack:
         slots: dict[int, ProcessPoolExecutor] = {}

@@ -1,4 +1,4 @@
-"""One recording of a batch: what `identify` and `diagnose` find, kept by the recording's content."""
+"""A recording of a batch: what `identify` and `diagnose` find, kept by the recording's content."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Options:
 
 
 def examined(verbs: Verbs, options: Options, job: Job) -> list[Row]:
-    """One row: the record, or {"error": reason}. `job`: absolute path, content. A broken file never raises."""
+    """A row: the record, or {"error": reason}. `job`: absolute path, content. A broken file never raises."""
     path = str(job[0])
     with contextlib.redirect_stderr(io.StringIO()):
         try:
@@ -116,8 +116,8 @@ def _of(axis: Mapping[str, Any], keys: Sequence[str]) -> dict[str, Any]:
 
 
 def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
-    """What the readings and the innovations show at once: `marks`, and the `lattice` of the readings where they lie on
-    one. Chance gives a sound axis no mark."""
+    """What the readings and the innovations show at once: `marks`, and the `lattice` of the readings, if any. Chance
+    gives a sound axis no mark."""
     if "error" in axis:
         return {}
     checks = axis["checks"]

@@ -23,7 +23,7 @@ SUFFIXES = (".csv", ".parquet")
 
 
 class BatchUnit:
-    """One recording of the batch with its answer: `record` (batch/unit_record.py), or `error`."""
+    """A recording of the batch with its answer: `record` (batch/unit_record.py), or `error`."""
 
     def __init__(self, source: BatchSource, record: Mapping[str, Any]) -> None:
         recording = record.get("recording", {})

@@ -39,7 +39,7 @@ CHANCE = 0.8
 
 @dataclass(frozen=True)
 class Limit:
-    """A bound of one quantity of an axis: `side` is 'max' or 'min', `value` in `unit`."""
+    """A bound of a quantity of an axis: `side` is 'max' or 'min', `value` in `unit`."""
 
     axis: str
     parameter: str
@@ -157,8 +157,8 @@ def _quantity(where: str, text: Any, like: str) -> tuple[float, str]:
 
 
 def judge_limits(limits: Iterable[Limit], axes: Mapping[str, Any], duration_s: float) -> list[Verdict]:
-    """The verdicts of one recording of `duration_s`; `axes`: those of the document of `identify`, or with a
-    `posterior` those of `diagnose`."""
+    """The verdicts of a recording of `duration_s`; `axes`: those of the document of `identify`, or with a `posterior`
+    those of `diagnose`."""
     return [_judged(limit, axes.get(limit.axis), duration_s) for limit in limits]
 
 

@@ -27,7 +27,7 @@ ANGLE_SD: float = _library32.TUMBLE_ANGLE_SD
 SQUARE_SD: float = _library32.TUMBLE_SQUARE_SD
 #: sd of the temperature coefficient, m/s^2/degC (1 mg/degC).
 THERMAL_SD = 0.01
-#: Numbers of the parameters, and their places; that of gravity's one is an index.
+#: Numbers of the parameters, and their places; gravity's place is an index.
 SIZES = (3, 3, 3, 1, 3)
 BIAS, SCALE, ANGLE, _, THERMAL = slices(SIZES)
 GRAVITY = ANGLE.stop
@@ -35,7 +35,7 @@ GRAVITY = ANGLE.stop
 PLACES = ((0, 1), (0, 2), (1, 2))
 #: sd of a parameter that the logs do not have: not 0, so that the prior has an inverse.
 NONE = float(np.finfo(float).eps)
-#: Largest distance of a parameter from its prior's mean, sd: no accelerometer has a larger one.
+#: Largest distance of a parameter from its prior's mean, sd: larger in no accelerometer.
 REACH: float = _library32.TUMBLE_REACH
 
 

@@ -18,9 +18,9 @@ HEIGHTS, GRAVITIES = (-500.0, 10_000.0), (9.7, 9.9)
 
 @dataclass(frozen=True)
 class Place:
-    """`gravity`, m/s^2, with its `sd`; the Earth's rate, rad/s: `vertical` part (None: unknown) and the sd of each of
-    its other parts, `level_sd` of the two in the level plane, `vertical_sd` of the unknown vertical one. `words`: where
-    gravity is from."""
+    """`gravity`, m/s^2, with its `sd`. The Earth's rate, rad/s: `vertical` part (None: unknown) and the sd of each of
+    its other parts, `level_sd` of the two in the level plane, `vertical_sd` of the unknown vertical part. `words`:
+    where gravity is from."""
 
     gravity: float
     sd: float
@@ -59,7 +59,7 @@ def place(latitude_deg: float | None, height_m: float | None, gravity: float | N
     if gravity is not None:
         return Place(gravity, 0.0, *of_earth, "stated")
     if latitude_deg is None:
-        # sd of gravity over the inhabited Earth about the standard one, m/s^2.
+        # sd of gravity over the inhabited Earth about the standard gravity, m/s^2.
         return Place(STANDARD_GRAVITY, 0.015, *of_earth, "standard: neither --latitude nor --gravity is given")
     height_sd = 0.0 if height_m is not None else HEIGHT_SD
     value = gravity_at(latitude_deg, height_m or 0.0)

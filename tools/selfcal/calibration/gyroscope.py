@@ -3,7 +3,7 @@
 A rest shows y = b + c (temp - reference) + G f + the Earth's rate. A turn carries gravity's direction u from the rest
 before to the rest behind it: with the rotation Q of the integrated rate, Q^T u is the direction there. A small rotation
 d of Q in the frame of its end moves Q^T u by (Q^T u) x d, and d is the sum over the samples of the rotation from each
-to the end, times the error of its rate. So one pass of the integral has every derivative.
+to the end, times the error of its rate. So a single pass of the integral has every derivative.
 
 Parameters: the accelerometers' own, b x y z [rad/s], G by rows [rad/s/g], K x y z, T xy xz yx yz zx zy [rad],
 the vertical rate of the Earth that no latitude states [rad/s], c x y z [rad/s/degC], and for each chain of turns the
@@ -165,7 +165,7 @@ class _Directions:
 
     @staticmethod
     def of(theta: Array, tumble: Tumble) -> _Directions:
-        """At parameters."""
+        """The directions at parameters `theta`."""
         force, to, M = forces(theta, tumble.accel, tumble.warmth)
         size = np.linalg.norm(force, axis=1)[:, None]
         u = force / size
@@ -183,7 +183,7 @@ class _Problem:
         self.turns = tuple(turn for turn in self.tumble.turns if not turn.reason)
         self.behind = {turn.first + 1: k for k, turn in enumerate(self.turns)}  # turn that leads to a rest
         self.chain = np.cumsum([k not in self.behind for k in range(self.count)]) - 1
-        self.y = np.nan_to_num([rest.gyro for rest in rests])  # one that is not recorded weighs nothing
+        self.y = np.nan_to_num([rest.gyro for rest in rests])  # an axis that is not recorded weighs nothing
         self.white = np.array([self.tumble.noise[name].white for name in GYRO])
         self.of_rests = [self.white / rest.seconds + rest.rounded[3:] for rest in rests]
         self.of_accel_means = [means_covariance(self.tumble, k, float(accel.fit.theta[k])) for k in range(3)]
@@ -212,7 +212,7 @@ class _Problem:
         # Noise enters by the means of the gyros over rests and turns, by those of the accelerometers, and within turns.
         by_gyro, by_accel = np.zeros((size, count + len(self.turns), 3)), np.zeros((size, count, 3))
         R = np.zeros((size, size))
-        level = np.zeros((3, 2))  # the level directions of the chain's first rest, in the frame of this one
+        level = np.zeros((3, 2))  # the level directions of the chain's first rest, in the frame of this rest
         earth = (self.accel.place.vertical or 0.0) + own[VERTICAL]
         for k in range(count):
             of_level = OF_ACCEL + LEVEL + 2 * int(self.chain[k]) + np.arange(2)

@@ -22,7 +22,7 @@ from selfcal.readings.budget import FALSE_ALARM
 
 SCHEMA = "selfcal.tumble/1"
 AXES = ("x", "y", "z")
-#: Names of parameters in the order of the fit: group, empty for one of the surroundings, name, unit.
+#: Names of parameters in the order of the fit: group (empty: of the surroundings), name, unit.
 OF_ACCEL = (
     *(("bias", name, "m/s^2") for name in ACCEL),
     *(("scale", name, "1") for name in ACCEL),
@@ -90,7 +90,7 @@ def tumble_document(
 
 
 def _entry(fit: TumbleFit, k: int, unit: str, size: float) -> dict[str, Any]:
-    """A parameter; no number of one that is not identified."""
+    """A parameter; without its numbers if it is not identified."""
     identified = bool(fit.identified[k])
     value, sd = size * float(fit.theta[k]), size * math.sqrt(float(fit.covariance[k, k]))
     ends = (value - HALF_90 * sd, value + HALF_90 * sd)
@@ -146,7 +146,7 @@ def side_up(up: Array) -> str:
 
 
 def _positions(accel: Accelerometer) -> list[str]:
-    """Further rests by which every parameter would be identified, the most informative one first."""
+    """Further rests by which every parameter would be identified, the most informative rest first."""
     fit, place, own = accel.fit, accel.place, slice(0, accelerometer.GRAVITY)
     if fit.identified[own].all():
         return []

@@ -41,7 +41,7 @@ class Whole:
 def write_calibration(
     form: str, path: Path | str, accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]
 ) -> None:
-    """Write a file in one of FORMS. Raises UserError where the bias or scale of an axis is not identified."""
+    """Write a file in a form of FORMS. Raises UserError where the bias or scale of an axis is not identified."""
     unknown = _unknown(document, "accelerometer", ("bias", "scale"))
     if unknown:
         mend = "; ".join(document["accelerometer"]["would_mend"])

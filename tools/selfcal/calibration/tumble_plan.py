@@ -84,7 +84,7 @@ class TumbleWish:
 
 def reached(model: Model, count: int, length_s: float) -> dict[str, float]:
     """Half of the widest 90 % interval of each group in WISHES, SI units, that PLAN_SHARE of the placements have at
-    most; infinite where one is not identified."""
+    most; infinite where any parameter is not identified."""
     noise = {}
     for name in ACCEL + GYRO:
         group = model.group_of(name)
@@ -109,7 +109,7 @@ def _placed(random: np.random.Generator, positions: Sequence[tuple[int, int, int
 
 
 def _of_placement(noise: dict[str, Noise], readings: Array, length_s: float) -> dict[str, float]:
-    """Half of the widest interval of each group for one placement with readings [n, 3]."""
+    """Half of the widest interval of each group for a placement with readings [n, 3]."""
     begin = (length_s + TURN_S) * np.arange(len(readings)) + 0.5 * CUT_S
     none, seconds = np.zeros(6), length_s - CUT_S
     rests = tuple(

@@ -24,7 +24,7 @@ ACCEL, GYRO = ("ax", "ay", "az"), ("gx", "gy", "gz")
 UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
 #: Time that is cut off a rest next to a motion, s: its first and last movement is below the noise of a piece.
 SETTLE_S = LEVEL_PIECE_S
-#: Shortest rest that is advised, s, and what the search for motion takes off both ends of one at most, s.
+#: Shortest rest that is advised, s, and the most that the search for motion takes off both its ends, s.
 REST_LEAST_S, CUT_S = 10.0, 6.0 * LEVEL_PIECE_S
 #: Most rests: the fit is dense.
 RESTS_MOST = 200
@@ -33,7 +33,7 @@ REST_PIECES = PIECES_LEAST
 #: Shares of a drift's mean square under a wide prior that are weighed: nearly four decades of its deviation, up to its
 #: limit. Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
 PRIOR_SHARES, RESTLESS = 10.0 ** (1.5 - np.arange(0.0, 8.0, 0.75)), 10.0
-#: Assumed time between two logs without stamps of one clock, s.
+#: Assumed time between two logs without stamps of a common clock, s.
 BETWEEN_S = 60.0
 
 
@@ -57,9 +57,9 @@ class Rest:
 
 @dataclass(frozen=True)
 class Turn:
-    """Samples between the rests `first` and the one behind it: `accel` [n, 3], m/s^2, and `gyro` [n, 3], rad/s, each
-    `dt` s; lost ones are bridged. `unsure` [n, 3]: variance of `gyro` by that. `reason`: why the turn is left out, or
-    ""."""
+    """Samples between the rest `first` and the rest behind it: `accel` [n, 3], m/s^2, and `gyro` [n, 3], rad/s, each
+    `dt` s; lost samples are bridged. `unsure` [n, 3]: variance of `gyro` by that. `reason`: why the turn is left out,
+    or ""."""
 
     first: int
     dt: float
@@ -82,7 +82,7 @@ class Tumble:
 
     @property
     def has_gyro(self) -> bool:
-        """The logs have gyros; one that is not recorded weighs nothing."""
+        """The logs have gyros; an axis that is not recorded weighs nothing."""
         return GYRO[0] in self.noise
 
     def wide(self, names: Sequence[str]) -> int:
@@ -146,7 +146,7 @@ class Tumble:
 
     @property
     def temp(self) -> Array:
-        """[n], degC; 0 where not all rests have one."""
+        """[n], degC; 0 where not all rests have a temperature."""
         temp = np.array([rest.temp for rest in self.rests])
         return temp if np.isfinite(temp).all() else np.zeros(temp.size)
 
@@ -179,8 +179,8 @@ class Tumble:
 @dataclass(frozen=True)
 class _Log:
     """A log on the clock of its fastest axes: its columns in the units used here, the same with straight lines over
-    lost readings, the step of the lattice of each (0: none), its temperature, degC, NaN without one, and the rows of
-    its rests."""
+    lost readings, the step of the lattice of each (0: none), its temperature, degC, NaN if unknown, and the rows of its
+    rests."""
 
     recording: Recording
     begin_s: float
@@ -214,7 +214,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
     turns: list[Turn] = []
     left_out: list[str] = []
     for k, log in enumerate(logs):
-        end = -1  # the row behind the rest before, if that one counts
+        end = -1  # the row behind the rest before, if that rest counts
         for rows in log.rests:
             rest = _rest(k, log, rows)
             if reason := _unfit(log, rows, ranges, typical):
@@ -284,7 +284,7 @@ def _noise(logs: Sequence[_Log], name: str, model: Model, long_rest: Recording |
 
 
 def _begins(recordings: Sequence[Recording]) -> tuple[list[float], list[str]]:
-    """When each log begins on one clock, s, and what is assumed of it."""
+    """When each log begins on a common clock, s, and what is assumed of it."""
     if len(recordings) == 1:
         return [0.0], []
     stamps = [recording.started_s for recording in recordings]
@@ -348,7 +348,7 @@ def _unfit(log: _Log, rows: slice, ranges: dict[str, float], typical: dict[str, 
 
 
 def _turn(log: _Log, begin: int, end: int, ends: tuple[Rest, Rest], first: int, ranges: dict[str, float]) -> Turn:
-    """Samples from the last one of a rest to the first one of the next; `ends`: the two rests."""
+    """Samples from the last of a rest to the first of the next rest; `ends`: the two rests."""
     rows = slice(begin - 1, end + 1)
     place = log.recording.clock.place[rows]
     place = place - place[0]
@@ -374,8 +374,8 @@ def _turn(log: _Log, begin: int, end: int, ends: tuple[Rest, Rest], first: int, 
 
 def _bridged(values: Array) -> tuple[Array, Array]:
     """Readings of an axis [n] with straight lines over the lost ones, and the variance of the rate that this leaves
-    [n], as if it were that of one sample of each gap. A line over a span misses a parabola by 2/3 of its sagitta; the
-    mean square of the sagittas is that of all such spans of the turn, its noise included."""
+    [n], put on a single sample of each gap. A line over a span misses a parabola by 2/3 of its sagitta; the mean square
+    of the sagittas is that of all such spans of the turn, its noise included."""
     lost, variance = ~np.isfinite(values), np.zeros(values.size)
     values = bridged(values)
     for first, behind in runs(lost):

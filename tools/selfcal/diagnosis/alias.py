@@ -1,4 +1,4 @@
-"""A line that means show at a frequency below half of their rate: which one of the recorded readings it is."""
+"""The line of the recorded readings that makes a line of means, below half of the means' rate."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from selfcal.bank.blocks import MOST_DENSE
 from selfcal.base.grid import Array
 from selfcal.logs.recording import Recording, bridged
 
-#: Bins of the spectrum on each side that hold a line, at least; and those beside them that give the noise below it.
+#: Least bins of the spectrum on each side that hold a line, and the next bins, which give the noise below it.
 HALF, BINS_BESIDE = 4, 40
 #: Share of its frequency by which a line wanders along a record: its power is looked for within that.
 WANDERS = 0.02
@@ -22,10 +22,10 @@ LINE_POWER_LEAST = 10.0
 def alias_of(
     recording: Recording, axis: str, frequency_hz: float, half_width_hz: float, rate_hz: float
 ) -> tuple[float, float] | None:
-    """Frequency, Hz, and amplitude, in the recording's unit, of the line of an axis that makes one of `frequency_hz` in
-    means at `rate_hz`. None where none is clear, or most of a long grid is missing.
+    """Frequency, Hz, and amplitude, in the recording's unit, of the line of an axis that makes a line of `frequency_hz`
+    in means at `rate_hz`. None if no line is clear, or most of a long grid is missing.
 
-    Every line at k rate ± frequency does. The one is taken of which most power is left in the means."""
+    Every line at k rate ± frequency does. The line that leaves most power in the means is taken."""
     own = recording.along(axis)
     read, recorded_hz = bridged(own.columns[axis].values), own.rate_hz
     place_of = own.clock.place

@@ -1,6 +1,6 @@
-"""One verdict: what of a record stands out that no named cause explains.
+"""The verdict: what of a record stands out that no named cause explains.
 
-The statistics of a look are judged as one family. How often the most striking of them stands out by chance comes from
+The statistics of a look are judged as a family. How often the most striking of them stands out by chance comes from
 the same simulated records as their bands. The looks at means of 1 s and at every sample, and the checks of `identify`,
 are joined: an axis is adequate where none of them objects.
 """
@@ -27,7 +27,7 @@ from selfcal.readings.budget import AXES_COUNT, OF_MODULES
 SHOWN = (("innovation_mean", "innovation_means"), ("innovation_ln_variance", "noise_level"))
 #: Probability that the statistics call an axis of a fitting record inadequate, and that a channel's coherence does.
 P_FAMILY, P_COHERENCE = (OF_MODULES[name] / AXES_COUNT for name in ("statistics", "coherence"))
-#: A first ensemble screens: axes below this have a second one, which knows its tail, unless there is no doubt.
+#: A first ensemble screens: axes below this have a second ensemble, which knows its tail, unless there is no doubt.
 P_SCREEN, P_CERTAIN, AGAIN = 2e-2, 1e-12, 240
 
 

@@ -39,7 +39,7 @@ def add_biases(document: dict[str, Any], recording: Recording, model: Model, sta
 
 def beside(y: Array, dt: float, loading: Array, rate: float) -> Joint:
     """The model of records y [m, n] of means `dt` s long, with a quantity of that `loading` [m] and `rate` a mean: the
-    axes' own drifts and white noise are fitted beside it."""
+    axes' own drifts and white noise are fitted with it."""
     bins = bins_of(y)
     alone = fit_joint(bins, dt, f=False)
     return fit_joint(bins, dt, f=True, start=replace(alone, loading=loading, rate=rate), held=True)

@@ -1,7 +1,7 @@
 """What a finding gains on a second recording: the bank's own evidence there, with the finding in the model and without.
 
-The evidence is sequential: each bank sample is predicted from earlier ones, over the posterior of the noise's
-parameters. Coefficients are those of the first recording. A size that belongs to one recording, such as a line's phase,
+The evidence is sequential: each bank sample is predicted from the samples before, over the posterior of the noise's
+parameters. Coefficients are those of the first recording. A size that belongs to a recording, such as a line's phase,
 is weighed anew under its prior. Each finding is left out of the model with all of them.
 """
 
@@ -40,7 +40,7 @@ SECOND_LEAST = 5 * SECOND_PIECES
 
 @dataclass(frozen=True)
 class BankTerm:
-    """One finding as a part of the bank's model: columns with their coefficients, or a change of the model file's tree.
+    """A finding as a part of the bank's model: columns with their coefficients, or a change of the model file's tree.
     `anew`: the sizes of its columns are weighed anew."""
 
     finding: Finding
@@ -52,8 +52,7 @@ class BankTerm:
 def gains(
     model: Model, tree: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed], second: Recording
 ) -> dict[str, tuple[list[HeldOut], HeldOut]]:
-    """By axis one entry for each finding of `found`, by gain, and one of all together. `tree`: the extended model
-    file's."""
+    """Entries by axis: each finding of `found`, by gain, and all together. `tree`: the extended model file's."""
     return {name: _of_axis(model, tree, record, found, name, second) for name in found}
 
 
@@ -79,7 +78,7 @@ def _of_axis(
         return [HeldOut(None, term) if isinstance(term, str) else none for term in terms], none
 
     def gained(others: Sequence[BankTerm]) -> HeldOut:
-        """By all terms over the `others`."""
+        """Gain of all terms over the `others`."""
         try:
             return HeldOut(_compared(_evidence(model, record, found, name, readings, others), whole))
         except UserError as error:
@@ -95,13 +94,13 @@ def _of_axis(
 
 
 def why_stays(finding: Finding) -> str:
-    """Why no other recording has a finding; "": one can."""
+    """Why no other recording can have a finding; "": another can."""
     cause = CAUSES[finding.look.cause]
     return cause.score.no_carry(finding.look) or cause.score.once
 
 
 def term_of(axis: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> BankTerm | str:
-    """The finding as a part of the bank's model, or why it is none. `extended`: the model file's regressors."""
+    """The finding as a part of the bank's model, or why it cannot be. `extended`: the model file's regressors."""
     cause = CAUSES[finding.look.cause]
     added = finding.columns
     if added:
@@ -173,13 +172,13 @@ def with_terms(
             extend(Extension(tree, model, record, name, found, term.finding))
     own = Model.of_tree(tree, model.path)
     own = replace(own, regressors=(*own.regressors, *columns))
-    if own.regressors:  # a module handles changes beside no column
+    if own.regressors:  # a module with columns handles no changes
         own = replace(own, handling=replace(own.handling, steps=False, variance_changes=False))
     return own
 
 
 def _compared(without: Array, whole: Array) -> dict[str, Any]:
-    """The contract's `gain_on`. The first piece is all the priors', so the scatter is that of the others."""
+    """The contract's `gain_on`. The priors decide the first piece, so the scatter is taken over the others."""
     if (without[0] != whole[0]).any():
         raise UserError("the bank takes other samples with the finding than without")
     n = whole[0]

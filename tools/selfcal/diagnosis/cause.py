@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from selfcal.likelihood.state import FittedColumn, Look, State
     from selfcal.model.file import Model
 
-#: Looks at one axis: the candidates of one cause or of several.
+#: Looks at an axis: the candidates of a cause or of several.
 Looks = Callable[["State", "Record"], "list[Look]"]
 
 
@@ -40,7 +40,7 @@ def is_count(value: float) -> bool:
 
 @dataclass(frozen=True)
 class Key:
-    """One key of `simulate --effect`: its value when it is not given (None: then it is not there), and which values it
+    """A key of `simulate --effect`: its value if it is not given (None: then it is not there), and which values it
     may have (`fits`, `limits` in words). `field`: the member of the simulator's axis, or scene, that takes it; "" where
     `Cause.add` or the read-out does."""
 
@@ -98,10 +98,10 @@ def sized(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[s
 
 @dataclass(frozen=True)
 class Grouping:
-    """What makes findings one (events.py).
+    """What merges findings (events.py).
 
-    alike   whether two looks are one event or source: the same time, line, channel or law.
-    pairs   its looks name the other axis of a pair (`other`): pairs that meet are one group of axes.
+    alike   whether two looks are the same event or source: the same time, line, channel or law.
+    pairs   its looks name the other axis of a pair (`other`): pairs that meet form a group of axes.
     piece   whether a look is a piece of a hidden quantity, of which it gets the axes and the times of jumps, s.
     settle  after the rounds of all axes: joins, moves or adds findings.
     most    times at most that the loop names it on an axis; 0: as often as it is found.
@@ -119,9 +119,9 @@ class Scored:
     """How it is scored on held-out time (score.py), and on another recording (carried.py).
 
     no_gain   why a gain on held-out time is not defined.
-    once      why another recording has it not: an event of its time, or of its read-out. "": it may have it.
+    once      why another recording cannot have it: an event of its time, or of its read-out. "": it may have it.
     no_carry  why the bank cannot weigh a look on another recording that has it; "": it can.
-    anew      its size belongs to one recording: another one weighs it anew under its prior.
+    anew      its size belongs to a recording: another recording weighs it anew under its prior.
     trained   look, states before and after, record and split: the state after as the first `split` samples show it. An
               event is scored from its on-line detection, `Look.when[0]`.
     together  nats a sample that two axes gain, and their sd: residuals of both, spacing, s, split and the estimate.
@@ -145,7 +145,7 @@ class Written:
     law        adds a law to a tree without which N is wrong: `identify` reports by it.
     extend     writes what is no column.
     stated     whether a model file has it already: then it is no finding. A column is in the model from the start.
-    of_column  keys of `--effect` for columns of the file: the first one and the coefficients of all.
+    of_column  keys of `--effect` for columns of the file: the first column and the coefficients of all.
     """
 
     entry: Callable[[Mapping[str, Any], Look | None, Record], dict[str, Any]] = sized
@@ -164,7 +164,7 @@ class Simulated:
     keys         its keys; empty: it cannot be simulated.
     follows      the effect follows another axis: the key `other`.
     common       the effect is of the whole recording and has no axis.
-    of_estimate  keys for a finding where they are not the medians of its estimate; None, or none of them: the simulator
+    of_estimate  keys for a finding where they are not the medians of its estimate; None, or no keys: the simulator
                  cannot make it.
     add          what the effect adds to a reading before the read-out, [n]: keys, channels.
     spoil        changes the finished readings of an axis in place: those, keys, rate, Hz, lattice, random numbers.
@@ -180,7 +180,7 @@ class Simulated:
 
 @dataclass(frozen=True)
 class Cause:
-    """Everything about one cause.
+    """Everything about a cause.
 
     id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of any look, or
               by the look.
@@ -227,7 +227,7 @@ class Cause:
 
     @property
     def several(self) -> bool:
-        """Whether the simulator makes several of its effects on an axis: no member holds one, or all intervals do."""
+        """Whether the simulator makes several of its effects on an axis: no member, or `intervals`, holds them."""
         keys = self.simulated.keys
         return "intervals" in keys or (self.simulated.add is not None and not any(key.field for key in keys.values()))
 

@@ -43,15 +43,15 @@ KEYS = {"rate": "rate", "square": "square", "cube": "cube"}
 #: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The model
 #: file's window is as wide and trails: a module has no later values.
 SMOOTHING_S = (1.0, 10.0, 30.0, 90.0)
-#: Windows of a rate, s. A lattice of 0.14 degC wants a long one, a quick change of the channel a short one.
+#: Windows of a rate, s. A lattice of 0.14 degC needs a long window, a quick change of the channel a short window.
 RATE_WINDOWS_S = (20.0, 40.0, 60.0, 90.0, 150.0, 400.0)
 #: Widths of a play over the channel's own range.
 PLAYS = (0.05, 0.1, 0.2, 0.35, 0.55, 0.8)
-#: A lag is looked at up to this share of the record: a longer one is a ramp as well.
+#: Longest lag, as a share of the record: a longer lag is a ramp as well.
 LONGEST_LAG = 1.0 / 3.0
 #: Share of a column below which the change by a lag or a play is ignored.
 ALIKE_COLUMN = 0.1
-#: ln of the number of independent looks that each form beside the static one costs, over all channels' forms.
+#: ln of the number of independent looks that each form costs beyond the static form, over all channels' forms.
 LN_FORMS = {
     "static": 0.0,
     "lag": 3.0,
@@ -73,8 +73,8 @@ KEPT_LEAST = 0.3
 @dataclass(frozen=True)
 class Channel:
     """What may act: `values` [n] of the channel `column` in `unit`, about `reference` of it. `name` is that of its
-    regressors, `widths_s` of its smoothing means. `slow`: its gain must hold over all possible drifts. `extra`: what
-    the estimate says of it. `ln_looks`: price of its search."""
+    regressors, `widths_s` of its smoothing means. `slow`: its gain must hold over all possible drifts. `extra`: its
+    further entries in the estimate. `ln_looks`: price of its search."""
 
     cause: str
     name: str
@@ -130,7 +130,7 @@ def side_of(cause: str, column: str, values: Array) -> Channel:
 
 
 def look(state: State, channels: Sequence[Channel]) -> list[Look]:
-    """The look of each channel that is worth one nat."""
+    """The look of each channel that is worth 1 nat."""
     return [look for channel in channels for look in _look(state, channel)]
 
 
@@ -198,7 +198,7 @@ def _span(channel: Channel) -> float:
 
 
 def form_of(column: FittedColumn) -> tuple[str, str, str]:
-    """Channel, input and form of a column in a model; no channel for one of time alone."""
+    """Channel, input and form of a column in a model; no channel for a column of time alone."""
     entry = column.entry
     form = "rate" if entry.get("kind") == "rate" else str(entry.get("form", "static"))
     return str(entry.get("column", "")), str(entry.get("input", "value")), form
@@ -216,7 +216,7 @@ def _widths(channel: Channel, state: State) -> list[float]:
 
 
 def _windows(channel: Channel, state: State) -> list[int]:
-    """The same in samples."""
+    """`_widths` in samples."""
     return [max(1, round(width / state.dt)) for width in _widths(channel, state)]
 
 
@@ -227,7 +227,7 @@ def shapes_of(channel: Channel, state: State) -> Iterator[Shape]:
 
 
 def variants_of(channel: Channel, state: State) -> Iterator[tuple[str, float, float]]:
-    """Every form that the model has not, with its numbers, NaN where it has none, and the widths of its means, s."""
+    """Every form that the model lacks, with its number, NaN if it has no number, and the width of its means, s."""
     n, dt = channel.values.size, state.dt
     widths = _widths(channel, state)
     middle = widths[len(widths) // 2]
@@ -285,7 +285,7 @@ def _lags(channel: Channel, state: State) -> list[float]:
 
 
 def _differs(column: Array, plain: Array, spread: float) -> bool:
-    """Whether a column is another one than the plain one times a constant."""
+    """Whether a column differs from the plain column times a constant."""
     a, b = column - column.mean(), plain - plain.mean()
     left = a - b * (float(a @ b) / max(float(b @ b), 1e-300))
     return float(left.std()) > ALIKE_COLUMN * spread
@@ -322,7 +322,7 @@ def _look(state: State, channel: Channel) -> list[Look]:
 
 
 def _noiseless(channel: Channel, shape: Shape, state: State) -> dict[str, Any]:
-    """The posterior of the sizes, a static one over the share that the channel's own noise leaves of it."""
+    """The posterior of the sizes, a static size over the share that the channel's own noise leaves of it."""
     sizes = columns.measured(shape, state)
     if shape.form != "static":
         return sizes
@@ -332,12 +332,12 @@ def _noiseless(channel: Channel, shape: Shape, state: State) -> dict[str, Any]:
 
 
 def _constant(state: State, trial: Tried) -> bool:
-    """Whether each column of a form has one coefficient at all frequencies, as far as the record shows."""
+    """Whether each column of a form has the same coefficient at all frequencies, as far as the record shows."""
     return trial.net < ALIKE or _inconstant(state, trial) < NET_LEAST
 
 
 def _inconstant(state: State, trial: Tried) -> float:
-    """Of the column that shows it most: beside a square the plain column may still be a common source's."""
+    """`inconstancy` of the column with the most: next to a square the plain column may still be a common source's."""
     rows = trial.shape.columns
     return max(inconstancy(state, rows[k], np.delete(rows, k, axis=0)) for k in range(len(rows)))
 
@@ -346,7 +346,7 @@ def inconstancy(state: State, column: Array, beside: Array | None = None) -> flo
     """-ln p of a coefficient that is the same at every frequency.
 
     A reading that follows another axis does so at all frequencies alike. Two axes that share a line, a temperature or a
-    shock agree at some frequencies only, and the axis that is followed does not follow with one coefficient either.
+    shock agree at some frequencies only, and the axis that is followed has no constant coefficient either.
     `beside`: columns [k, n] that are in the model as well.
     """
     series = state.series if beside is None or not len(beside) else state.series.beside(beside)
@@ -357,7 +357,7 @@ def inconstancy(state: State, column: Array, beside: Array | None = None) -> flo
 
 def agreement(u: Array, w: Array, *, any_phase: bool = False) -> tuple[float, int]:
     """How a record w [n] goes with a column u [n], both white: chi squared, a coefficient in each band, and the number
-    of bands. Bands hold equal information. `any_phase`: what comes at another time counts too, a second one a band."""
+    of bands. Bands hold equal information. `any_phase`: any shift in time counts, by a second coefficient a band."""
     U, W = rfft(u), rfft(w)
     A, B = np.abs(U) ** 2, np.conj(U) * W
     edges = np.searchsorted(np.cumsum(A) / A.sum(), np.linspace(0.0, 1.0, BANDS + 1)[1:-1])
@@ -372,7 +372,7 @@ def agreement(u: Array, w: Array, *, any_phase: bool = False) -> tuple[float, in
 
 
 def _kept(state: State, column: Array, channel: Channel, window: int) -> float:
-    """Share of a coefficient that the own noise of a channel leaves: the share of the information that is none of it.
+    """Share of a coefficient that the own noise of a channel leaves: the share of the information without that noise.
 
     `column` is the channel smoothed over `window` samples. Neighbouring readings differ by their noise alone. It is
     drawn anew, smoothed and whitened as the channel is. The column enters whole, so its noise lowers the coefficient.
@@ -385,7 +385,7 @@ def _kept(state: State, column: Array, channel: Channel, window: int) -> float:
 
 
 def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, str]] | None:
-    """The coefficient of a channel that this record would have shown; None where it has none that changes."""
+    """The coefficient of a channel that this record would have shown; None if the channel is missing or constant."""
     if channel not in record.channels:
         return None
     shape = shape_of(_side(record, channel), state, "static", math.nan, SMOOTHING_S[1])
@@ -393,7 +393,7 @@ def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, 
     return found if found and math.isfinite(found["coefficient"][0]) else None
 
 
-#: Keys of `simulate --effect` beside the coefficient: the numbers of a form, and its other coefficients.
+#: Keys of `simulate --effect` besides the coefficient: the numbers of a form, and its other coefficients.
 EFFECT_KEYS = {
     **{key: positive(None) for key in ("lag_s", "width", "delay_s", "window_s")},
     **{key: Key(None) for key in ("rate", "square", "cube", "knots")},
@@ -401,7 +401,7 @@ EFFECT_KEYS = {
 
 
 def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
-    """What the forms of a channel add to a reading beside its static coefficient, [n]; but for a rate 0 at the first
+    """What the forms of a channel add to a reading besides its static coefficient, [n]; but for a rate 0 at the first
     sample."""
     interval_s = float(channels.time_s[1] - channels.time_s[0])
     total = np.zeros(values.size)
@@ -426,7 +426,7 @@ def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
 
 
 def of_column(column: FittedColumn, c: Sequence[float]) -> dict[str, Any]:
-    """Keys of `simulate --effect` for one column of a form."""
+    """Keys of `simulate --effect` for a column of a form."""
     form = form_of(column)[2]
     if form in ("rate", "square", "cube"):
         window = {"window_s": float(column.entry["window_s"])} if form == "rate" else {}
@@ -437,7 +437,7 @@ def of_column(column: FittedColumn, c: Sequence[float]) -> dict[str, Any]:
 
 
 def of_other(column: FittedColumn, c: Sequence[float]) -> dict[str, Any]:
-    """The same of another axis."""
+    """Keys of `simulate --effect` for a column of another axis."""
     return {**of_column(column, c), "other": str(column.entry["column"])}
 
 

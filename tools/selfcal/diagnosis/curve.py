@@ -1,8 +1,8 @@
-"""A channel acts by a curve of its own: a correction table, a dip, a bend at one temperature.
+"""A channel acts by a curve of its own: a correction table, a dip, a bend at a temperature.
 
-A spline with a few knots shows that there is one. Its hinges and jumps are then chosen one after the other, as long as
-each pays for its search (forward selection as of Friedman 1991, Annals of Statistics 19, 1): few that are right leave
-the drift beside them what is its own.
+A spline with a few knots shows that there is a curve. Its hinges and jumps are then chosen in turn, as long as each
+pays for its search: forward selection (Friedman 1991, Annals of Statistics 19, 1). A few right terms leave the drift
+what is its own.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ def spline(values: Array, places: Sequence[float] | Array) -> Array:
 
 
 def counts(samples: int) -> list[int]:
-    """Knots that so many samples can tell apart, and memory holds the columns of."""
+    """Numbers of knots that `samples` can resolve, and whose columns memory holds."""
     return [count for count in KNOTS if 10 * count < samples and 2 * count * samples * len(KNOTS) < NUMBERS_MOST]
 
 
 def knots_of(values: Array, count: int) -> list[float]:
-    """So many knots, even over the range, less those that no value is near."""
+    """`count` knots, even over the range, less those that no value is near."""
     places = np.linspace(values.min(), values.max(), count)
     near = 0.5 * (places[1] - places[0])
     return [float(place) for place in places if np.any(np.abs(values - place) < near)]
 
 
 def best(state: State, found: Tried, means: Array) -> Tried:
-    """The curve of `means` [n] of the channel as one column of mean 0 and deviation 1: hinges and jumps, or the spline
-    that was found where no few of these are evident by themselves."""
+    """The curve of `means` [n] of the channel as a column of mean 0 and deviation 1: hinges and jumps, or the spline
+    that was found if these are not evident by themselves."""
     (column,) = found.shape.regressors
     heights = [0.0, *found.fit.c[-len(found.shape.columns) :]]
     whole = _as_one(state, found, column, means, column.entry["knots"], heights)
@@ -92,7 +92,7 @@ def _sorted(places: Array, heights: Array) -> tuple[Array, Array]:
 
 
 def _picked(state: State, fit: Fit, terms: Array) -> list[int]:
-    """Terms [k, n] one after the other: the one that gains most beside those before it, while it pays its search."""
+    """Terms [k, n] in turn: the term that gains most over those before it, while it pays its search."""
     parts = np.array_split(terms, math.ceil(len(terms) / ABREAST))
     each = [left_of(state.series, fit, part) for part in parts]
     u, left = np.concatenate([part[:, 1:] for part in each], axis=1), each[0][:, 0] / fit.sigma
@@ -119,7 +119,7 @@ def _as_one(
     places: Sequence[float] | Array,
     heights: Sequence[float] | Array,
 ) -> Tried:
-    """The curve as one column of the model file."""
+    """The curve as a column of the model file."""
     values = np.interp(means, places, heights)
     scale, middle = max(float(values.std()), 1e-300), float(values.mean())
     knots = [[digits(float(x), 8), digits(float(y - middle) / scale)] for x, y in zip(places, heights, strict=True)]
@@ -130,7 +130,7 @@ def _as_one(
 
 
 def trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
-    """With the heights of a curve as coefficients of their own: those of later values are not known before."""
+    """The state with the heights of a curve as coefficients: those of later values are not known before."""
     known = {regressor.name for regressor in before.regressors}
     own = next(
         (

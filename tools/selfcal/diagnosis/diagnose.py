@@ -113,7 +113,7 @@ def entry_of(
 
 
 def events_of(record: Record) -> dict[str, Array]:
-    """By axis what events of several axes add to the means of a record, which no model of another one has."""
+    """Means [n] by axis that events of several axes add to a record, and that no model of another record has."""
     states = {name: state.refit() for name, state in record.axes.items()}
     seen = module.together(states, record.channels, record.since_power_on_s + record.start_s)
     return {} if seen is None else {name: seen.effect(name) for name in seen.names}
@@ -129,10 +129,10 @@ def less_stated(axis: Diagnosed, model: Model) -> Diagnosed:
 def by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
     """Axes without a cause must pass the checks of `identify`, whose bank has the whole model."""
     for name, diagnosed in found.items():
-        # Beside a hidden quantity other axes explain one as it does.
+        # With a hidden quantity, other axes explain an axis as the quantity does.
         if diagnosed.findings or diagnosed.hidden is not None or diagnosed.state.below_lattice or model.beyond:
             continue
-        # An axis that follows this one would explain it as well.
+        # An axis that follows this axis would explain it as well.
         follow = {
             axis for axis, other in found.items() for each in other.findings if each.look.estimate.get("other") == name
         }
@@ -173,9 +173,9 @@ def below_lattice(record: Record, name: str) -> bool:
 def add_posteriors(
     document: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed], model: Model, ending: HeldSignals
 ) -> dict[str, Identified | None]:
-    """What the extended model knows of each axis at rest, as `identify` tells it; None where the record bears no
-    report, and after a signal. The document has its posterior. Readings of a loud while are left out: a bank has one
-    level of noise."""
+    """What the extended model knows of each axis at rest, as `identify` reports it; None if the record allows no
+    report, and after a signal. The document has its posterior. Readings of a loud while are left out: a bank has a
+    single level of noise."""
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     known: dict[str, Identified | None] = {}
     for name, axis in axes.items():

@@ -82,7 +82,7 @@ def _axis(axis: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Fin
 
 
 def _band(row: Statistic) -> dict[str, float]:
-    """A statistic beside its simulated band."""
+    """A statistic with its simulated band."""
     return {"measured": row.measured, "simulated_q005": row.q005, "simulated_q995": row.q995, "p": row.p}
 
 
@@ -119,7 +119,7 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str, final: 
         "judged_at_hz": record.rate_hz,
         "words": " ".join(filter(None, [words.sentence(look.cause, estimate), _plausibility(look)])),
         "evidence_gain_nats": look.gain,
-        "net_nats": min(look.net, look.gain),  # a search of less than one look is paid for by nothing
+        "net_nats": min(look.net, look.gain),  # a search of less than one look costs nothing
         "estimate": estimate,
         "when": later(list(look.when), record.start_s) if look.when else None,
         "found_in_round": finding.round,
@@ -138,7 +138,7 @@ def _is_time(key: str, value: Any) -> bool:
 
 
 def later(value: Any, start_s: float) -> Any:
-    """A time of the record, s, or any form of several, as one of the recording."""
+    """A time of the record, s, or any form of several, as a time of the recording."""
     if isinstance(value, Mapping):
         return {key: later(entry, start_s) if key not in ("sd", "unit") else entry for key, entry in value.items()}
     if isinstance(value, list | tuple):
@@ -159,7 +159,7 @@ def _plausibility(look: Look) -> str:
 
 
 def _not_found(axis: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:
-    """For every cause that has a size the one from which half of the records with it would have been named."""
+    """For every cause that has a size: the size from which half of the records with it would have been named."""
     named = {finding.look.cause for finding in axis.findings}
     rows = []
     with suppress(Stopped):
@@ -185,7 +185,7 @@ def _not_judged(axis: Diagnosed, record: Record) -> list[dict[str, str]]:
 
 
 def _in_unit(value: Any, inner: str, factor: float, unit: str) -> Any:
-    """An interval in the recording's unit where its own begins with the axis' one, or is that times a second."""
+    """An interval in the recording's unit where its own begins with the axis' unit, or is that times a second."""
     if not isinstance(value, Mapping):
         return value
     own = str(value["unit"])

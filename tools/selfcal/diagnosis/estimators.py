@@ -1,8 +1,8 @@
-"""Other ways to identify an influence, beside the answer by prediction error: least squares, ARMAX, Box and Jenkins's
+"""Other ways to identify an influence, besides the answer by prediction error: least squares, ARMAX, Box and Jenkins's
 model, instruments, correlation, subspace.
 
 Input u and output y pass the whitening filter of the fitted drift first, so that G(s) stays between them and the noise
-of y is white. All work on means over one step, a third of the delay that they look for.
+of y is white. All work on means over a step, a third of the delay that they look for.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from selfcal.likelihood.state import State
 ORDERS, TAPS = 4, (1, 2, 4, 8, 16, 32)
 #: Orders of a model whose noise has poles or zeros of its own at most, and instruments on each side.
 NOISE_ORDERS, INSTRUMENTS = 2, 6
-#: Residual sum of squares, free numbers, and gain and delay, of one order.
+#: Residual sum of squares, free numbers, and gain and delay, of an order.
 Tried = tuple[float, int, tuple[float, float]]
 
 
@@ -50,7 +50,7 @@ class OrderEstimate:
 
 @dataclass(frozen=True)
 class OtherMethod:
-    """One method beside the answer: its `estimate`, and least and most [2] of gain and delay over records that the
+    """A method besides the answer: its `estimate`, and least and most [2] of gain and delay over records that the
     answer makes."""
 
     estimate: OrderEstimate
@@ -159,7 +159,7 @@ def correlation(u: Array, y: Array) -> OrderEstimate:
 
 def subspace(u: Array, y: Array) -> OrderEstimate:
     """A state model by PO-MOESP (Verhaegen, Automatica 30, 1994): past input and output are the instruments. Of several
-    heights of the block matrices each order keeps the likeliest. A pole slower than a third of the record is none."""
+    heights of the block matrices each order keeps the likeliest. No pole may be slower than a third of the record."""
     before = np.concatenate([[0.0], u[:-1]])
     slowest = math.exp(-1.0 / (LONGEST_LAG * y.size))
 
@@ -224,7 +224,7 @@ def methods_beside(
     for name, method in METHODS.items():
         given = raw if name in AS_READ else quiet
         own = method(given, y)
-        # Of the order that the record took: another one is another estimate.
+        # Of the order that the record took: another order is another estimate.
         each = [method(given, output).values for output in drawn]
         spread = np.array(
             [by_order[own.order] for by_order in each if own.order in by_order] or [(own.gain, own.delay)]

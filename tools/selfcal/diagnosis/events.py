@@ -1,9 +1,9 @@
-"""Findings of all axes as events and sources: one entry each, what it changes, and those that matter first.
+"""Findings of all axes as events and sources: an entry each, what it changes, and those that matter first.
 
 A finding is material where it moves a number that the user takes away: N, K or B of an axis by more than half of the
 stated 90 % interval and by 5 %; or the bias by half of its interval; or the error of the bias ahead by 5 %, on held-out
 time and beyond 2 sd. N, K and B without a finding are those of the final model less it, refitted; with it those of the
-final one. The stated intervals are those of the extended model.
+final model. The stated intervals are those of the extended model.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from selfcal.readings.moves import joined_intervals
 
 #: The numbers, and their names in a summary.
 SUMMARY = {"N": "arw", "K": "rrw", "B": "bias_instability"}
-#: The key of what a slow change of a channel does.
+#: Key of the response to a slow change of a channel.
 COEFFICIENT = "coefficient"
 #: Units of what several axes have in common; all else is a size on an axis. Probability of axes that differ as much by
 #: chance, below which they disagree.
@@ -44,7 +44,7 @@ OF_ALL, DISAGREE = ("s", "Hz", "deg"), 1e-3
 
 @dataclass(frozen=True)
 class EventMember:
-    """A finding of one axis, and its entry in the document. `factor` turns the axis' inner unit into the recording's.
+    """A finding of an axis, and its entry in the document. `factor` turns the axis' inner unit into the recording's.
     `plain`: the noise of the readings with what the finding left out, over that without."""
 
     axis: str
@@ -66,7 +66,7 @@ class EventMember:
             return 0.0 if before is after else (bias_ahead(after) - bias_ahead(before)) * self.factor
 
     def joins(self, other: EventMember) -> bool:
-        """Whether both are one event or source."""
+        """Whether both are the same event or source."""
         a, b = self.finding.look, other.finding.look
         events = (self.finding.event, other.finding.event)
         if a.cause != b.cause or all(events):
@@ -79,7 +79,7 @@ class EventMember:
 
 @dataclass
 class Event:
-    """One event or source: its `members`, the strongest first. `entry`: of a hidden quantity, which its pieces join.
+    """An event or source: its `members`, the strongest first. `entry`: of a hidden quantity, which its pieces join.
     `axes`: that it acts on, in the document's order."""
 
     members: list[EventMember]
@@ -113,7 +113,7 @@ def add_findings(
     quantity: dict[str, Any] | None,
 ) -> None:
     """Put the list of all axes into the document, the id of its event into each finding of an axis, the verdicts, and
-    N, K and B before and after. `known`: by the extended model, of each axis; `quantity`: the entry of a hidden one."""
+    N, K and B before and after. `known`: by the extended model, of each axis; `quantity`: a hidden quantity's entry."""
     members = []
     for name, diagnosed in found.items():
         factor = units.factor(diagnosed.state.unit, document["axes"][name]["unit"])
@@ -153,7 +153,7 @@ def add_findings(
 
 
 def grouped(members: Sequence[EventMember], quantity: dict[str, Any] | None = None) -> list[Event]:
-    """Events and sources: a finding joins the first that it is one with, the nearest in time; else it begins one."""
+    """Events and sources: a finding joins the event that it matches, the nearest in time; else it begins an event."""
     events = [] if quantity is None else [Event([], quantity)]
     jumps = [] if quantity is None else [jump["time_s"] for jump in quantity["estimate"]["jumps"]]
     for member in sorted(members, key=lambda member: -member.finding.look.net):
@@ -173,7 +173,7 @@ def grouped(members: Sequence[EventMember], quantity: dict[str, Any] | None = No
         nearest.members.append(member)
         for other in (
             fitting if CAUSES[look.cause].grouping.pairs else ()
-        ):  # a pair that joins two groups makes them one
+        ):  # a pair that joins two groups of axes merges them
             if other is not nearest:
                 nearest.members += other.members
                 events.remove(other)
@@ -181,13 +181,13 @@ def grouped(members: Sequence[EventMember], quantity: dict[str, Any] | None = No
 
 
 def _apart(event: Event, member: EventMember) -> float:
-    """Time between an event and a finding, s; 0 where they have none."""
+    """Time between an event and a finding, s; 0 if either has no time."""
     one, two = event.members[0].finding.look.when, member.finding.look.when
     return 0.0 if one is None or two is None else abs(one[0] - two[0])
 
 
 def _plain(axis: Diagnosed, finding: Finding, recording: Recording, factor: float) -> float:
-    """White noise of the readings as they were read over that of those that were kept, by their differences: what was
+    """White noise of the readings as they were read over that of the kept readings, by their differences: what was
     left out before any fit cannot be fitted without. 1 where the loop has a model without the finding."""
     read = axis.record.readings.get(axis.state.axis)
     if finding.before is not finding.after or finding.round or read is None:
@@ -214,8 +214,8 @@ def _sides(before: State, after: State, factor: float, plain: float) -> tuple[di
 
 
 def _calm(before: State, after: State) -> float:
-    """The variance where the noise is at its lowest level, over the model's nominal one: a finding may have made it
-    several."""
+    """The variance where the noise is at its lowest level, over the model's nominal variance: a finding may have made
+    several levels."""
     return float(np.quantile(after.r / before.r, ENDS[0]))
 
 
@@ -288,7 +288,7 @@ def _better(row: Mapping[str, float]) -> bool:
 
 
 def _entry(event: Event) -> dict[str, Any]:
-    """The document's."""
+    """The event's entry in the document."""
     looks = [member.finding.look for member in event.members]
     rows = [member.entry for member in event.members]
     if event.entry is not None:
@@ -328,8 +328,8 @@ def _worth(members: Sequence[EventMember]) -> float:
 
 
 def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed]) -> bool:
-    """What a line in means is in the readings: its frequency there, and its amplitude on each axis. Whether it is
-    another one there."""
+    """Add a line of means as it is in the readings: its frequency there, and its amplitude on each axis. Whether its
+    frequency is another there."""
     told = []
     for axis, on_axis in entry["axes"].items():
         line, rate_hz = entry["estimate"]["frequency_hz"], found[axis].record.rate_hz
@@ -363,7 +363,7 @@ def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _of_all(values: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """One number that each axis shows by its own readings: the product of normal posteriors of its logarithm. Of the
+    """A number that each axis shows by its own readings: the product of normal posteriors of its logarithm. Of the
     strongest finding alone where the axes disagree by more than chance, or a value may be 0."""
     ln = np.log([[max(value[key], 0.0) or math.nan for key in ("q05", "median", "q95")] for value in values])
     if not (np.isfinite(ln).all() and np.ptp(ln[:, 1]) > 0.0):  # a number of all axes already
@@ -376,7 +376,7 @@ def _of_all(values: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def _on(event: Event, axis: str) -> dict[str, Any]:
-    """Sizes of an event on one axis, and the probability that it acts there."""
+    """Sizes of an event on an axis, and the probability that it acts there."""
     own = [member for member in event.members if member.axis == axis]
     sizes = {
         key: value
@@ -389,8 +389,8 @@ def _on(event: Event, axis: str) -> dict[str, Any]:
 
 
 def _sum_of_forms(own: Sequence[EventMember]) -> dict[str, Any]:
-    """The coefficient of one channel on an axis that several findings share, each in a form of its own: what a slow
-    change of the channel does is their sum, beside the model with all of them. Empty where one form has it all."""
+    """The coefficient of a channel on an axis that several findings share, each in a form of its own: a slow change of
+    the channel acts by their sum, in the model with all of them. Empty where a single form has it all."""
     last = max(own, key=lambda member: member.finding.round)
     shapes = [member.finding.look.shape for member in own]
     keyed = [shape for shape in shapes if shape is not None and [key for key, _ in shape.keys].count(COEFFICIENT) == 1]
@@ -410,7 +410,7 @@ def _sum_of_forms(own: Sequence[EventMember]) -> dict[str, Any]:
 
 
 def _confirmed(gains: Sequence[Mapping[str, Any] | None]) -> bool | None:
-    """Whether held-out time of all axes confirms it beyond 2 sd; None: none is defined."""
+    """Whether held-out time of all axes confirms it beyond 2 sd; None: no gain is defined."""
     known = [gain for gain in gains if gain]
     return in_sd(known) > HARM_SD if known else None
 
@@ -419,13 +419,13 @@ def _before_and_after(
     axis: Diagnosed, drift: tuple[State, State], members: Sequence[EventMember], unit: str, known: Identified | None
 ) -> dict[str, dict[str, Any]]:
     """N, K and B of an axis: without any finding, and with all, as the extended model has them where that is `known`.
-    Both are then in its measure: an axis without findings has one number. `drift`: as `_changes` has it."""
+    Both are then in its measure: an axis without findings has the same number twice. `drift`: as `_changes` has it."""
     factor = units.factor(axis.state.unit, unit)
     if any("y" in finding.look.changes for finding in axis.findings):  # the bank has the readings as they were read
         known = None
     old, whole = _sides(axis.first, drift[0], factor, math.prod(member.plain for member in members))
     _, new = _sides(axis.first, drift[1], factor, 1.0)
-    mean = float((axis.state.r / axis.first.r)[~axis.loud].mean())  # the bank has one level
+    mean = float((axis.state.r / axis.first.r)[~axis.loud].mean())  # the bank has a single level
     found: dict[str, dict[str, Any]] = {}
     for name, key in SUMMARY.items():
         after: dict[str, Any] = {"median": new[name], "identified": new[name] > 0.0}
@@ -440,8 +440,8 @@ def _before_and_after(
 
 
 def parted(findings: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
-    """The findings of a document to print in full, and the small ones: these change no number by as much as matters. A
-    hidden quantity and time that is left out are printed in any case."""
+    """The findings of a document to print in full, and the small findings, which change no number by as much as
+    matters. A hidden quantity and time that is left out are printed in any case."""
     told: list[Mapping[str, Any]] = []
     small: list[Mapping[str, Any]] = []
     for finding in findings:
@@ -451,7 +451,7 @@ def parted(findings: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any
 
 
 def times_of(finding: Mapping[str, Any]) -> list[tuple[float, float]]:
-    """From when to when an event lasts, s of the recording; empty where it acts all the time."""
+    """Begin and end of an event, s of the recording; empty where it acts all the time."""
     estimate = finding["estimate"]
     times = [estimate["time_s"]["median"]] if "time_s" in estimate else []
     length_s = estimate["duration_s"]["median"] if "duration_s" in estimate else 0.0

@@ -79,7 +79,7 @@ def extended(
 
 
 def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
-    """Fewer nodes on the Cortex-M0 where its RAM needs them: beside a second column, or a law that is a sum."""
+    """Fewer nodes on the Cortex-M0 where its RAM needs them: with a second column, or a law that is a sum."""
     columns = sum(2 if entry["kind"] == "periodic" else 1 for entry in regressors)  # a sine and a cosine of a line
     nodes = tree["nodes"]
     if "cortex-m0" in nodes and "cortex-m0-small" in nodes:
@@ -90,7 +90,7 @@ def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
 
 def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[list[str], list[tuple[str, Finding]]]:
     """Regressors that the model file has room for: those that a bank has columns for first, and the most evidence
-    first. Findings that a bank has none for, with their axes: a finding fits whole or not at all."""
+    first. Findings that a bank has no columns for, with their axes: a finding fits whole or not at all."""
     stated = {column for regressor in model.regressors for column in regressor.columns}
     beyond = {column for axis in model.beyond for column in axis.columns}
     offered: list[tuple[float, str, Finding | None, dict[str, int]]] = []
@@ -176,8 +176,8 @@ def finding_of(axis: Diagnosed, column: Column) -> Finding | None:
 
 
 def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) -> None:
-    """The window whose trailing mean, or slope, explains the axes best. A centred one, which the diagnosis takes, needs
-    values that a module does not have yet; a trailing one lags, so a shorter window suits it."""
+    """The window whose trailing mean, or slope, explains the axes best. A centred window, as in the diagnosis, needs
+    values that a module does not have yet; a trailing window lags, so a shorter window suits it."""
     explained = [axis for axis in found.values() if any(column.name == name for column in axis.state.regressors)]
     record = max((axis.record for axis in explained), key=lambda record: record.rate_hz)
     gains: dict[float, float] = {}
@@ -263,8 +263,8 @@ def regressor_key(column: str) -> str:
 
 
 def _effects(name: str, axis: Diagnosed) -> list[str]:
-    """`--effect` texts that put what an axis has into a simulated record. The simulator itself has one effect of a
-    kind on an axis: the strongest. Those that a cause adds are all there. The forms of one channel are one effect."""
+    """`--effect` texts that put what an axis has into a simulated record. The simulator itself has a single effect of a
+    kind on an axis: the strongest. Effects that a cause adds are all there. The forms of a channel are one effect."""
     joined: dict[object, _Effect] = {}
     for k, effect in enumerate([*_of_columns(axis), *_of_findings(axis)]):
         place: object = (effect.cause.id, *effect.channel) if effect.channel else k

@@ -13,18 +13,18 @@ from selfcal.diagnosis.statistics import Statistic
 from selfcal.likelihood.heldout import HeldOut
 from selfcal.likelihood.state import FittedColumn, Look, State
 
-#: Rounds at most: a recording that holds more is told as it is then.
+#: Most rounds: a recording that holds more causes is reported as it is then.
 ROUNDS = 12
-#: What has no name.
+#: Name of a misfit without a cause.
 UNEXPLAINED = "unexplained"
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One named cause on one axis. `partner`: the other axis, of a cause that two share. `held_out`: its gain, where
-    the loop has asked for it. `event`: above 0, the one of several axes that it is a part of.
+    """A named cause on an axis. `partner`: the other axis, of a cause that two share. `held_out`: its gain, where the
+    loop has asked for it. `event`: above 0, the number of the event of several axes that it is a part of.
     `record`: the means that it was found in, where its axis was looked at in every sample. `ends`: the model with all
-    findings of its axis but this one, and with all of them, once the loop has both."""
+    other findings of its axis, and with all findings, once the loop has both."""
 
     look: Look
     round: int
@@ -44,7 +44,7 @@ class Finding:
         return self.ends or (self.before, self.after)
 
     def ended(self, final: State) -> Finding:
-        """The same with its `ends`: what it added to the model of its round is taken out of the `final` one."""
+        """The finding with its `ends`: what it added to the model of its round is taken out of the `final` model."""
         before, after = self.before, self.after
         if before is after or after is final:
             return replace(self, ends=(final if before is after else before, final))
@@ -73,13 +73,13 @@ def rarer(level: Array) -> Mask:
 
 @dataclass
 class Diagnosed:
-    """One axis after the loop: what it began as, what it is, and what was found in which record.
+    """An axis after the loop: what it began as, what it is, and what was found in which record.
 
     harmful     looks that predict held-out time clearly worse, which are no findings.
     dropped     looks that other axes explain.
     stated      what the model file has already, which is no finding either.
     unfinished  why it is not done, "" if it is.
-    hidden      what moves several axes, this one among them.
+    hidden      what moves several axes, this axis among them.
     """
 
     first: State
@@ -109,7 +109,7 @@ class Diagnosed:
 
     @property
     def by_gain(self) -> list[Finding]:
-        """The findings, the one that gains most first."""
+        """The findings, the largest gain first."""
         return sorted(self.findings, key=lambda finding: finding.look.gain, reverse=True)
 
     @property

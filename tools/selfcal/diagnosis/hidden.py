@@ -1,7 +1,7 @@
-"""One quantity that nobody recorded and that moves several axes: found, drawn over time, and weighed on held-out time.
+"""A quantity that nobody recorded and that moves several axes: found, drawn over time, and weighed on held-out time.
 
 The axes are taken together by `likelihood/joint.py`, as means of a second or more, with the models that the loop has
-found. Jumps of several axes at one time come before the quantity: it would follow them.
+found. Jumps of several axes at the same time come before the quantity: it would follow them.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Hidden:
         return fit_joint(self.bins, self.dt, False, self.model)
 
     def worth(self, *, stated: bool) -> tuple[float, float]:
-        """Nats by the quantity with its jumps, and net of the search; by the jumps alone of one that is `stated`."""
+        """Nats by the quantity with its jumps, and net of the search; by its jumps alone if it is `stated`."""
         count = len(self.jumps)
         known, choice = (0, 0.0) if stated else (len(self.names) + 1, LN_EITHER)
         before = course(self.model if stated else self.null, self.y)
@@ -169,8 +169,8 @@ class Hidden:
         return None if model is None else replace(self, model=model, y=y)
 
     def explains(self, source: str, others: Collection[str], upto_hz: float = 0.0) -> bool:
-        """Whether noise that an axis shares with some others below a frequency is the quantity's: beside it their white
-        noise does not go together."""
+        """Whether noise that an axis shares with some others below a frequency is the quantity's: with it in the model
+        their white noise does not go together."""
         if not {source, *others} <= set(self.names) or upto_hz > 0.501 / self.dt:
             return False
         at, *places = [self.names.index(name) for name in (source, *others)]
@@ -178,7 +178,7 @@ class Hidden:
 
     @cached_property
     def of_others(self) -> dict[str, Array]:
-        """By axis the quantity [k] as the other ones show it."""
+        """The quantity [k] for each axis, as the other axes show it."""
         found = {}
         for name in self.names:
             others = [k for k, other in enumerate(self.names) if other != name]
@@ -205,7 +205,7 @@ def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
     model = fit_joint(bins, dt, True, null)
     if net(model.value - null.value, m + 1, LN_EITHER) < NET_LEAST:
         return None
-    # A drift that one axis has beside a walk and a Gauss-Markov process would be taken for the quantity.
+    # A drift of a single axis, besides a walk and a Gauss-Markov process, would be taken for the quantity.
     # An axis that the quantity moves shows 3 nats.
     if (without_each(bins, model) > 3.0).sum() < LEAST_AXES:
         return None
@@ -289,8 +289,8 @@ def _sentence(
 
 
 def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Array]) -> dict[str, Any] | None:
-    """What the quantity gains on a second recording by the models of the first, all axes together; None: it has not the
-    axes. `states`: of the second recording; `events`: by axis what its own events add to its means."""
+    """What the quantity gains on a second recording by the models of the first, all axes together; None: an axis is
+    missing. `states`: of the second recording; `events`: by axis what its own events add to its means."""
     if not set(hidden.names) <= states.keys():
         return None
     block = max(1, round(hidden.dt / states[hidden.names[0]].dt))
@@ -307,8 +307,8 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
 
 
 def extend(tree: dict[str, Any], hidden: Hidden) -> None:
-    """Put the quantity into a model file's tree, and the drifts beside it into the axes of its `simulate`. One that the
-    file states stays."""
+    """Put the quantity into a model file's tree, and the axes' own drifts into the axes of its `simulate`. A quantity
+    that the file states stays."""
     if tree.get("hidden_input"):
         return
     tree["hidden_input"] = _stated(hidden)
@@ -319,8 +319,8 @@ def extend(tree: dict[str, Any], hidden: Hidden) -> None:
 
 
 def _own_laws(hidden: Hidden) -> dict[str, dict[str, Any]]:
-    """By axis the drift that it has beside the quantity, as `simulate` in a model file has it: the larger of a walk and
-    a Gauss-Markov process over half the record."""
+    """Each axis' own drift, as `simulate` in a model file has it: the larger of a walk and a Gauss-Markov process over
+    half the record."""
     found = {}
     half = 0.5 * hidden.y.shape[1]
     for name, (ln_n, ln_rho, ln_markov, ln_rate), scale in zip(

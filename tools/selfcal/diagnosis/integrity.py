@@ -24,8 +24,8 @@ AVERAGED_MOST = 20
 
 
 def missing(record: Record) -> tuple[dict[str, Look], Mask]:
-    """By axis gaps in the stamps, and rows that repeat the one before: the logger held the last reading. The mask is
-    those, where an axis is found to miss samples."""
+    """Looks by axis: gaps in the stamps, and rows that repeat the row before: the logger held the last reading. The
+    mask is those rows, where an axis is found to miss samples."""
     held = _held(record)
     rows = np.flatnonzero(held) / record.rate_hz
     found: dict[str, Look] = {}
@@ -107,7 +107,7 @@ def of_readings(record: Record, axis: str) -> Iterator[Look]:
         yield _of_stretches("held_samples", nats, readings.slower_intervals, rate_hz=rate_hz)
     if readings.intervals:
         yield _of_stretches("stuck", readings.stuck_nats, readings.intervals)
-    if (common := readings.recurring) is not None:  # one value too often
+    if (common := readings.recurring) is not None:  # a value that comes too often
         mask, share = common.mask, common.share
         times = time_s[mask if mask.any() else readings.values == common.value]
         when = (float(times[0]), float(times[-1]))
@@ -125,7 +125,7 @@ def _of_stretches(cause: str, nats: float, intervals: Sequence[Sequence[float]],
 
 
 def _averaged(steps: float) -> bool:
-    """Whether the stated lattice has a whole number of these `steps`: the log has means of so many readings."""
+    """Whether the stated lattice has a whole number of these `steps`: the log has means of that many readings."""
     return 1.5 < steps < AVERAGED_MOST + 0.5 and abs(steps - round(steps)) < 0.002 * steps
 
 
@@ -168,8 +168,8 @@ def quantization(record: Record, axis: str) -> tuple[Look, State] | None:
 
 
 def _anew(record: Record, axis: str, look: Look) -> tuple[Look, State]:
-    """In a record at the recording's own rate the readings concerned are drawn anew, so that the rest is judged as if
-    they were sound. Means are of such from the start."""
+    """Draw the readings concerned anew in a record at the recording's own rate, so that the rest is judged as if they
+    were sound. Means are made of redrawn readings from the start."""
     state = record.axes[axis]
     if axis not in record.redrawn:
         return look, state

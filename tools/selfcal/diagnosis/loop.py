@@ -28,24 +28,24 @@ from selfcal.likelihood.heldout import HeldOut, harmful, in_sd
 from selfcal.likelihood.state import ALIKE, NET_LEAST, SLOW_S, FittedColumn, Look, State
 from selfcal.readings.moves import Moved
 
-#: Looks that one round tries on an axis.
+#: Looks that a round tries on an axis.
 LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)
-#: Those of a round at every sample, after one at means.
+#: Looks of a round at every sample, after a round at means.
 QUICK: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks and not cause.of_means)
-#: Those of causes that are of one axis: all axes together have nothing to say of them.
+#: Looks of causes that act on a single axis: all axes together do not judge them.
 OWN = {cause.looks for cause in CAUSES.values() if cause.looks and cause.grouping.settle is None}
 #: Why an axis is not done.
 INTERRUPTED = "interrupted before it was done"
 SPENT = "its work was bounded (tools/pages/diagnose.md): there may be more causes"
-#: A look that predicts held-out time worse is no cause. From this worth on it is no chance either.
+#: Worth, nats, from which a look that predicts held-out time worse, and so is no cause, is no chance either.
 UNLASTING = 2.0 * NET_LEAST
-#: Means that hold a jump: the one in which it lies, and the one beside it that may be that.
+#: Means that may hold a jump: the mean in which it lies, and a neighbour.
 HOLDS = 2
-#: Noise of a fit over that of the first one, below which it has none: of readings that are equal it explains them all.
+#: Noise of a fit over that of the first fit, below which no noise is left: such a fit explains readings that are equal.
 NO_NOISE = 1e-6
 #: Number of the first loud stretch of several axes, beyond those of events and lines.
 FIRST_LOUD = 1 + module.EVENTS_MOST + module.FAST_LINES
-#: From this finding on, a cause waits that was worth less than another one when it was last looked at.
+#: Findings of an axis from which on a cause waits, if it was worth less than another cause when it was last looked at.
 BUSY = 3
 
 
@@ -115,7 +115,7 @@ def diagnose_record(
             cause.grouping.settle(record, found)
 
     def again(name: str) -> None:
-        """What a finding that was dropped stood before may be one now."""
+        """Look again after findings were dropped: they may have hidden others."""
         axis = found[name]
         gone = [look for look in named[name] if not any(look.repeats(kept.look) for kept in axis.findings)]
         axis.dropped += gone
@@ -132,7 +132,7 @@ def diagnose_record(
 
 
 def _end(axis: Diagnosed, advance: Callable[[str], None]) -> None:
-    """What is left over, each finding beside all others, and the statistics of the model that the loop began with."""
+    """What is left over, each finding with all others, and the statistics of the model that the loop began with."""
     advance(f"{axis.state.axis}: statistics")
     _unexplained(axis)
     axis.findings = [each if each.record is not None else each.ended(axis.state) for each in axis.findings]
@@ -142,8 +142,8 @@ def _end(axis: Diagnosed, advance: Callable[[str], None]) -> None:
 
 
 def _weed(found: Mapping[str, Diagnosed]) -> None:
-    """Drop events of several axes that what was found after them explains as well, and axes of which it explains most:
-    noise with a memory, or a law that the first model had not, looks like events to it, and a leak shows one of another
+    """Drop events of several axes that later findings explain as well, and axes of an event that they mostly explain.
+    Noise with a memory, or a law that the first model lacked, looks like events to it. A leak shows an event of another
     axis again."""
     events: dict[int, list[tuple[Diagnosed, Finding]]] = {}
     for axis in found.values():
@@ -169,7 +169,7 @@ def _weed(found: Mapping[str, Diagnosed]) -> None:
 
 
 def _measure(axis: Diagnosed) -> None:
-    """Give each finding its sizes beside all others: a later column may have taken a part of an earlier one."""
+    """Give each finding its sizes with all others: a later column may have taken a part of an earlier column."""
     for k, finding in enumerate(axis.findings):
         if finding.record is None:
             beside = axis.state.without({column.name for column in finding.columns})
@@ -206,7 +206,7 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
 
 
 def _with_motion(record: Record, first: State, rest: State, moved: Moved) -> State:
-    """The state at `rest` with the readings of one event of its motion, as the `first` one has them."""
+    """The state at `rest` with the readings of an event of its motion, as the `first` state has them."""
     y, time = rest.y.copy(), record.time_s
     for begin, end in moved.intervals:
         inside = (time > begin - rest.dt) & (time < end + rest.dt)
@@ -216,7 +216,7 @@ def _with_motion(record: Record, first: State, rest: State, moved: Moved) -> Sta
 
 def _louder(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
     """Stretches in which the noise of several axes is louder go into the models of these, before a look at what axes
-    have in common: one source shakes them there. Those looks leave that time out."""
+    have in common: a common source shakes them there. Those looks leave that time out."""
     advance("noise of all axes")
     states = dict(record.axes)
     for number in range(FIRST_LOUD, FIRST_LOUD + (variance_change.CAUSE.grouping.most or ROUNDS)):
@@ -313,8 +313,8 @@ def _give(
 
 
 def _between(state: State, passing: Sequence[tuple[int, int]], span: float) -> State:
-    """The state less the samples in which a jump passes from one level to the other, known to means of `span` s. A
-    sample that is shorter than half a mean lies on one of the two, unless it takes several means."""
+    """The state less the samples in which a jump passes between levels, known to means of `span` s. A sample that is
+    shorter than half a mean lies on either level, unless the jump takes several means."""
     gone = np.zeros(state.y.size, bool)
     for begin, end in passing:
         if state.dt > 0.5 * span or end - begin > HOLDS:
@@ -382,7 +382,7 @@ def _sharper(finding: Finding, means: Record, columns: Sequence[FittedColumn], s
 
 
 def _rounds(record: Record, axis: Diagnosed, advance: Callable[[str], None], causes: Sequence[Looks]) -> None:
-    """Name what is worth it of some causes until nothing is."""
+    """Name the best look of some causes, round by round, until no look is worth it."""
     number = 1 + max((finding.round for finding in axis.findings), default=0)
     worth: dict[Looks, float] = {}
     seen: dict[Looks, list[Look]] = {}  # at this state
@@ -391,7 +391,7 @@ def _rounds(record: Record, axis: Diagnosed, advance: Callable[[str], None], cau
         looks = _looked(axis, record, causes, worth, seen)
         if not looks or looks[0].net < NET_LEAST:
             return
-        # Of what is as likely a channel that was recorded comes first.
+        # Among looks that are as likely, a channel that was recorded comes first.
         best = next((look for look in looks if look.cause in record.channels), looks[0])
         best = best if best.net > looks[0].net - ALIKE else looks[0]
         after = axis.state.refit(**best.changes) if best.changes else axis.state
@@ -413,14 +413,14 @@ def _rounds(record: Record, axis: Diagnosed, advance: Callable[[str], None], cau
 
 
 def _free(look: Look) -> bool:
-    """Whether it is a curve of a channel. Of a channel that only rises such a curve follows any drift."""
+    """Whether a look is a curve of a channel. If the channel only rises, the curve follows any drift."""
     return bool(look.estimate.get("form") == FREE)
 
 
 def _refuted(look: Look, held_out: HeldOut | None) -> bool:
     """Whether held-out time speaks against a look: it predicts that clearly worse or, of a curve, no better.
 
-    Of 60 clean axes with a strong drift beside a temperature that rises 8 showed a curve, each 2 sd and more worse."""
+    Of 60 clean axes with a strong drift and a temperature that rises 8 showed a curve, each 2 sd and more worse."""
     if _free(look):
         return held_out is None or held_out.gain is None or in_sd([held_out.gain]) <= 0.0
     return held_out is not None and held_out.harms
@@ -429,8 +429,8 @@ def _refuted(look: Look, held_out: HeldOut | None) -> bool:
 def _looked(
     axis: Diagnosed, record: Record, causes: Sequence[Looks], worth: dict[Looks, float], seen: dict[Looks, list[Look]]
 ) -> list[Look]:
-    """The looks of `causes`, the most worth first; what has no name comes after every cause that has one. `seen` are
-    those at this state. A cause waits while its `worth`, when it was last looked at, is less than the best has now."""
+    """The looks of `causes`, the most worth first; looks without a name come after every named cause. `seen`: looks at
+    this state. A cause waits while its `worth`, when it was last looked at, is less than the best has now."""
     named = Counter(finding.look.cause for finding in axis.findings)
     waiting = sorted((cause for cause in causes if cause not in seen), key=lambda cause: -worth.get(cause, math.inf))
     while True:
@@ -464,7 +464,7 @@ def _unexplained(axis: Diagnosed) -> None:
 
 
 def _unlasting(harmful: Sequence[Look]) -> Look | None:
-    """The most evident of the looks that predict held-out time worse, as what has no name."""
+    """The most evident of the looks that predict held-out time worse, as unexplained."""
     most = max(harmful, key=lambda look: look.net, default=None)
     if most is None or most.net < UNLASTING:
         return None

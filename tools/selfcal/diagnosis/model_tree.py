@@ -8,14 +8,14 @@ from typing import Any
 
 from selfcal.model.file import LARGEST, SMALLEST
 
-#: Nodes on the host of a law that is a sum: `sums.yaml` says what they bear.
+#: Nodes on the host of a law that is a sum, as `sums.yaml` has them.
 NODES = [24, 20]
-#: ... on the Cortex-M0, whose RAM holds one such law beside the random walk.
+#: Nodes of that law on the Cortex-M0, whose RAM holds a single such law besides the random walk.
 SMALL_NODES = [12, 8]
 
 
 def add_law(tree: dict[str, Any], law: str, parameter: str, prior: Mapping[str, Any], entry: Any = 1) -> None:
-    """Have the model one law more, with a prior of its parameter in every group and nodes on every target. `entry`: its
+    """Add a law to the model, with a prior of its parameter in every group and nodes on every target. `entry`: its
     odds, or the mapping that states its terms."""
     tree["hypotheses"].setdefault(law, entry)
     for target, nodes in tree["nodes"].items():

@@ -2,7 +2,7 @@
 
 Every candidate is a column x(t; theta), with an unknown size on each axis that has it. Its score and information come
 from the joint filter of all axes (likelihood/joint.py), and its evidence is a sum over the sets of axes. The search
-over theta is paid for once, whatever the set. What acts on one axis alone is left to the axis.
+over theta is paid for once, whatever the set. What acts on a single axis is left to the axis.
 """
 
 from __future__ import annotations
@@ -49,49 +49,49 @@ from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, SLOW_S, State
 
 #: False-alarm rate of the joint search at T nats, over e^-T: modules on which nothing acts (`make module-null`).
 NULL = 0.05
-#: Evidence of a candidate that is named, nats.
+#: Least evidence of a candidate that is named, nats.
 NAMED_NATS = math.log(NULL) + EVIDENT
 #: Means that the joint model takes at least, and the share of them that an axis may lack.
 JOINT_MEANS_LEAST, GAPS = 600, 0.3
 #: Evidence of an event that is beyond doubt, nats: before the quantity is weighed its wandering looks like events.
 CERTAIN = 25.0
-#: A mean so many deviations of the noise off the median of this many is left out: a spike is no event that lasts.
+#: Deviations of the noise beyond which a mean is off the median of its neighbours, and left out; means of that median.
 SPIKE, SPIKE_OF = 7.0, 5
 #: Means on either side of a jump that may be on neither level; the levels are those of twice as many farther off.
 PASSING = 6
-#: Events of a module at most, those of one axis among them.
+#: Most events of a module, with events of a single axis.
 EVENTS_MOST = 16
-#: Places beside the best one that share its evidence.
+#: Places on either side of the best that share its evidence.
 PLACES_NEAR = 30
-#: Places of a search that are weighed over the sets of axes: the best ones of all axes, and of each.
+#: Best places of all axes together that are weighed over the sets of axes, besides the best place of each axis.
 WEIGHED = 4
-#: Lines above the means' band that are looked at.
+#: Most lines above the means' band that are looked at.
 FAST_LINES = 6
-#: A line is fitted with the drifts so often at most, or until it moves by less than this many turns in the record.
+#: Most fits of a line with the drifts, and its move, turns in the record, below which they end.
 LOCKED, HELD = 6, 0.02
-#: Multiples of a line that are looked at with it, if it is no slow one.
+#: Multiples of a line that are looked at with it, unless it is slow.
 MULTIPLES = 5
-#: Jumps of all levels, the largest ones, of which each two may be the ends of a pulse.
+#: Number of the largest jumps of all levels, of which each two may be the ends of a pulse.
 PAIRED = 30
-#: Samples of a pulse at least.
+#: Least samples of a pulse.
 PULSE_LEAST = 4
-#: Share of the information of a step far from the ends, from which on two of them are taken as there.
+#: Share of the information of a step far from the ends, from which on two steps are taken as there.
 WHOLE_INFORMATION = 0.95
 #: Durations of a pulse, a factor apart, and its places in one duration.
 DURATION_RATIO, PLACES_IN = 1.15, 16
-#: Bins about a frequency that tell its noise.
+#: Bins on either side of a frequency that give its noise.
 BINS_OF_NOISE = 50
-#: A jump that one size of the quantity explains to this share is the quantity's own.
+#: Share of a jump that a single size of the quantity explains, above which the jump is the quantity's own.
 OWN_SHARE_LEAST = 0.7
 #: Causes of those jumps.
 JUMPS = ("step", "pulse")
 #: Causes that the quantity may be, with that pattern: its course has any shape.
 OF_TIME = (*JUMPS, "ramp", "turn_on")
-#: Slow curves that a quantity may go along, cosines of so many half turns and fewer.
+#: Slow curves that a quantity may go along, cosines of this many half turns and fewer.
 CURVES = 4
 #: Logarithm of a factor about a time constant within which others are as possible as their likelihood says.
 NEAR_TAU = 1.5
-#: Forms of a channel that are looked for on all axes together: those of one column.
+#: Forms of a channel that are looked for on all axes together: a single column of each.
 CHANNEL_FORMS = ("static", "lag", "rate", "square")
 
 
@@ -102,7 +102,7 @@ Shape = tuple[str, tuple[float, ...], Array, float]
 @dataclass(frozen=True)
 class JointEvent:
     """What the axes `names` have in common, of the shape `theta`, and what it is worth, nats. `passing`: from and
-    before which means it passes from one level to the other."""
+    before which means it passes between the levels."""
 
     names: tuple[str, ...]
     cause: str
@@ -114,8 +114,8 @@ class JointEvent:
 @dataclass(frozen=True)
 class Candidate:
     """A column of a `cause` with its shape `theta`; what it is worth on the axes, `price` the ln of the number of
-    independent looks of its search. `columns` [p, n]: of means. `passing`: from and before which means it passes from
-    one level to the other, of a jump."""
+    independent looks of its search. `columns` [p, n]: of means. `passing`: from and before which means a jump passes
+    between the levels."""
 
     cause: str
     theta: tuple[float, ...]
@@ -127,7 +127,7 @@ class Candidate:
 
     @property
     def evidence(self) -> float:
-        """Nats over none, net of the search. `more`: what the drift beside it changes."""
+        """Nats over no candidate, net of the search. `more`: what the drift fitted with it changes."""
         return self.act.evidence + self.more - self.price
 
     @property
@@ -136,12 +136,12 @@ class Candidate:
         return np.asarray(self.act.size.T @ self.columns)
 
     def of(self, names: Sequence[str]) -> JointEvent:
-        """As an event of the axes `names` that have it."""
+        """The candidate as an event of the axes `names` that have it."""
         held = tuple(names[k] for k in self.act.axes)
         return JointEvent(held, self.cause, self.theta, self.evidence, self.passing)
 
     def share_of(self, loading: Array) -> float:
-        """Share of its information that one size of a quantity with these loadings explains."""
+        """Share of its information that a single size of a quantity with these loadings explains."""
         held = self.act.axes
         if len(held) < 2 or len(self.columns) > 1:
             return 0.0
@@ -177,7 +177,7 @@ class SeenAxes:
 
     @cached_property
     def wandering(self) -> float:
-        """Evidence of the best of some slow curves, nats: what wanders goes like one, whatever channel does too."""
+        """Evidence of the best of some slow curves, nats: what wanders goes like a curve, and a channel may too."""
         t = (np.arange(self.n) + 0.5) / self.n
         shapes: list[Shape] = [("", (), np.cos(math.pi * half * t), math.log(CURVES)) for half in range(1, CURVES + 1)]
         return max((candidate.evidence for candidate in _weighed(self, shapes, _scored(self, shapes))), default=0.0)
@@ -189,7 +189,7 @@ class SeenAxes:
 
     @cached_property
     def cross(self) -> Array:
-        """[n // 2, m, m]: information of two steps so many samples apart, far from the ends."""
+        """[n // 2, m, m]: information of two steps by the samples between them, far from the ends."""
         turn = 2.0 * math.pi * np.maximum(np.arange(self.n // 2 + 1), 1) / self.n
         found: Array = np.asarray(irfft(self.model.precision(turn), self.n, axis=0))[: self.n // 2]
         return found
@@ -216,7 +216,7 @@ def _best(gain: Array, score: Array, known: Array, apart: int) -> list[int]:
 
 
 def _shared(gain: Array, at: int) -> float:
-    """ln of the number of places about the best one that share its evidence, by their gains [n]."""
+    """ln of the number of places about the best, `at`, that share its evidence, by their gains [n]."""
     near = gain[max(0, at - PLACES_NEAR) : at + PLACES_NEAR + 1] - gain[at]
     return float(logsumexp(np.minimum(near, 0.0)))
 
@@ -233,7 +233,7 @@ def steps(seen: SeenAxes) -> Iterator[Candidate]:
 
 
 def pulses(seen: SeenAxes) -> Iterator[Candidate]:
-    """Two jumps of one size, there and back. A first search takes their information as it is far from the ends."""
+    """Two jumps of the same size, there and back. A first search takes their information as it is far from the ends."""
     count = max(1, int(math.log(seen.n / 3.0 / PULSE_LEAST) / math.log(DURATION_RATIO)))
     lengths = np.unique((PULSE_LEAST * DURATION_RATIO ** np.arange(count)).astype(int))
     shock = seen.course.shock
@@ -271,8 +271,8 @@ def pulses(seen: SeenAxes) -> Iterator[Candidate]:
 
 
 def _moved(seen: SeenAxes, begin: int, end: int) -> tuple[int, int, float]:
-    """Each place of a pulse in turn at its best within a fifth of its length, and ln of the number of pairs of places
-    that share its evidence."""
+    """Best places of a pulse, each in turn within a fifth of its length; ln of the pairs of places that share its
+    evidence."""
     shock, alike = seen.course.shock, [0.0, 0.0]
     reach = max(2, (end - begin) // 5)
     for _ in range(2):
@@ -342,8 +342,8 @@ def lines(seen: SeenAxes) -> Iterator[Candidate]:
 
 def _combs(V: NDArray[np.complex128], known: Array, usable: Mask) -> Array:
     """Gains of lines by their spectrum V [places, m] with information `known` [places, m, m]: with a phase on each
-    axis, and with 1, 2, ... multiples [places, 1 + multiples] of one waveform for all axes. A multiple may lie a bin
-    or two off its place."""
+    axis, and with 1, 2, ... multiples [places, 1 + multiples] of a waveform that all axes share. A multiple may lie a
+    bin or two off its place."""
     white = np.linalg.solve(np.linalg.cholesky(known), V[:, :, None])
     power = np.where(usable[:, None, None], (white * np.swapaxes(white, 1, 2).conj()).real, 0.0)
     loud = np.trace(power, axis1=1, axis2=2)
@@ -360,17 +360,17 @@ def _combs(V: NDArray[np.complex128], known: Array, usable: Mask) -> Array:
 
 def _phased(waves: Array, score: Array, known: Array) -> Iterator[tuple[Act, float, Array]]:
     """Cosines and sines `waves` [2 k, n] by their scores [2 k, m] and information [k, m, m]: each with a phase on each
-    axis, and of one waveform for all, as a single source has it. Of each what it acts on, its price and its columns."""
+    axis, and of a waveform that all share, as from a single source. Of each its `Act`, its price and its columns."""
     yield act(score, np.repeat(known, 2, axis=0)), LN_EITHER, waves
     loud = np.sqrt(np.repeat(np.trace(np.linalg.solve(known[0], known), axis1=1, axis2=2), 2) / score.shape[1])
     of_first = score / loud[:, None]
     sizes, ways = np.linalg.eigh(of_first @ np.linalg.solve(known[0], of_first.T))
     form, falling = ways[:, -1] / loud, np.repeat(np.arange(1, 1 + len(known)), 2)
-    # Waveforms that differ: half a sphere over the width of the likelihood of one, 1 / sqrt(the fall of the square).
+    # Waveforms that differ: half a sphere over the width of a waveform's likelihood, 1 / sqrt(the fall of the square).
     half = 0.5 * sizes.size
     fall = np.maximum(sizes[-1] - sizes[:-1], 2.0 / math.pi)  # no width is beyond half a turn
     price = half * math.log(math.pi) - math.lgamma(half) + 0.5 * float(np.log(fall / (2.0 * math.pi)).sum())
-    # Before the record amplitudes fall like a square wave's: directions of normal ones (Tyler 1987, Biometrika 74).
+    # Before the record amplitudes fall like a square wave's: directions of normal numbers (Tyler 1987, Biometrika 74).
     price += float(np.log(loud / falling).sum() + half * np.log(((form * falling) ** 2).sum()))
     there = np.tensordot((form**2).reshape(-1, 2).sum(axis=1), known, 1)
     yield act((form @ score)[None], there), LN_EITHER + max(0.0, price), (form @ waves)[None]
@@ -384,7 +384,7 @@ def _waves(f: float, n: int, multiples: Sequence[int]) -> Array:
 
 
 def _level(ratio: Array, beside: int, axis: int) -> Array:
-    """How much louder or quieter than expected the bins of spectra are, by so many on either side along an axis. A line
+    """How much louder or quieter than expected the bins of spectra are, by the bins `beside` them along an axis. A line
     among them counts as little."""
     found: Array = uniform_filter1d(np.minimum(ratio, 4.0), 2 * beside + 1, axis=axis, mode="reflect")
     return np.maximum(found, 0.5)
@@ -392,7 +392,7 @@ def _level(ratio: Array, beside: int, axis: int) -> Array:
 
 def fast_lines(states: Mapping[str, State]) -> list[JointEvent]:
     """Lines of several axes above the band of means. They are looked for in the innovations of every sample, over the
-    level of their neighbours. One that an axis shows beyond doubt is left to it."""
+    level of their neighbours. A line that an axis shows beyond doubt is left to it."""
     names = [name for name, state in states.items() if not state.below_lattice]
     grids = {(states[name].y.size, states[name].dt) for name in names}
     if len(names) < 2 or len(grids) > 1:
@@ -430,8 +430,8 @@ def fast_lines(states: Mapping[str, State]) -> list[JointEvent]:
 
 
 def louder(states: Mapping[str, State]) -> JointEvent | None:
-    """The stretch in which the noise of several axes has another level; None: they show none. Beside it each axis has
-    its own noise, so that its evidence is that of the axes apart."""
+    """The stretch in which the noise of several axes has another level; None: no stretch is evident. Beside it each
+    axis has its own noise, so that its evidence is that of the axes apart."""
     names = [name for name, state in states.items() if not state.below_lattice]
     if len({(states[name].y.size, states[name].dt) for name in names}) != 1 or len(names) < 2:
         return None
@@ -474,7 +474,7 @@ def _of_multiples(weights: Array, known: Array, multiples: Sequence[int]) -> Cal
 
 
 def _turned(turns: Array, rows: Array) -> NDArray[np.complex128]:
-    """Sums [tried, m] of rows [n, m], each turned by so many turns a sample: of blocks first, which all turn alike."""
+    """Sums [tried, m] of rows [n, m], each turned by `turns` a sample: of blocks first, which all turn alike."""
     n, m = rows.shape
     block = math.isqrt(n) + 1
     blocks = np.concatenate([rows, np.zeros((-n % block, m))]).reshape(-1, block, m)
@@ -484,7 +484,7 @@ def _turned(turns: Array, rows: Array) -> NDArray[np.complex128]:
 
 
 def _of_columns(y: Array, model: Joint, weights: Array, multiples: Sequence[int]) -> Callable[[Array], Array]:
-    """The same, of slow lines, whose information differs from one frequency to the next."""
+    """Gain of slow lines by their multiples, whose information differs between frequencies."""
 
     def gain(tried: Array) -> Array:
         waves = np.vstack([_waves(float(f), y.shape[1], multiples) for f in tried])
@@ -510,7 +510,7 @@ def transients(seen: SeenAxes) -> Iterator[Candidate]:
 
 
 def _simplest(found: Iterable[Candidate]) -> list[Candidate]:
-    """Of what is as likely as a constant rate that one alone."""
+    """The constant rate, and only those other candidates that are clearly likelier."""
     found = list(found)
     ramp = max((candidate.evidence for candidate in found if candidate.cause == "ramp"), default=-math.inf)
     return [candidate for candidate in found if candidate.cause == "ramp" or candidate.evidence > ramp + ALIKE]
@@ -538,7 +538,7 @@ def _scored(seen: SeenAxes, shapes: Sequence[Shape]) -> tuple[Array, Array, Arra
 
 
 def _weighed(seen: SeenAxes, shapes: Sequence[Shape], scored: tuple[Array, Array, Array]) -> Iterator[Candidate]:
-    """Slow columns. The best ones are weighed over the drifts of each axis that its record leaves possible: a law
+    """Slow columns. The best columns are weighed over the drifts of each axis that its record leaves possible: a law
     alone is too sure of what a drift does over the whole record. Beside a quantity, which the axes have in common, the
     drifts are fitted anew."""
     columns, score, known = scored
@@ -570,7 +570,7 @@ def apart(seen: SeenAxes, candidate: Candidate) -> Candidate:
 
 
 def beside(seen: SeenAxes, candidate: Candidate) -> Candidate:
-    """The candidate with the drifts fitted anew beside its column, which it may have on any axis."""
+    """The candidate with the drifts fitted anew together with its column, which it may have on any axis."""
     known = information(seen.model, seen.y, candidate.columns[:1])[0]
     effect = sizes(candidate.columns @ seen.course.weights, known).T @ candidate.columns
     model = refitted(seen.model, seen.y - effect, seen.dt)
@@ -587,8 +587,8 @@ def _gained(seen: SeenAxes, candidate: Candidate, score: Array, model: Joint, fo
 
 
 def locked(seen: SeenAxes, candidate: Candidate) -> Candidate:
-    """A line with the drifts fitted anew beside it, at the frequency that it has there: drifts that were fitted without
-    have swallowed the most of a slow one, and what they left lies elsewhere."""
+    """A line with the drifts fitted anew, at the frequency that it has there: drifts that were fitted without it have
+    swallowed the most of a slow line, and what they left lies elsewhere."""
     n, multiples = seen.n, (1, *map(round, candidate.theta[1:]))
     for k in range(LOCKED):
         model = refitted(seen.model, seen.y - candidate.effect, seen.dt)
@@ -606,8 +606,8 @@ def locked(seen: SeenAxes, candidate: Candidate) -> Candidate:
 
 
 def settled(seen: SeenAxes, candidate: Candidate) -> Candidate:
-    """A bias that settles with the drifts fitted anew beside it, by the time constants that it may have there: ever
-    closer ones, until the record no longer tells them apart."""
+    """A bias that settles, with the drifts fitted anew, by the time constants that it may have there: ever closer,
+    until the record no longer distinguishes them."""
     t, (tau, step) = (np.arange(seen.n) + 0.5) * seen.dt + seen.since_s, candidate.theta
     for _ in range(LOCKED):
         model = refitted(seen.model, seen.y - candidate.effect, seen.dt)
@@ -631,8 +631,8 @@ def settled(seen: SeenAxes, candidate: Candidate) -> Candidate:
 
 
 def between_levels(seen: SeenAxes, candidate: Candidate) -> Candidate:
-    """A jump less the means in which it passes from one level to the other, with the drifts fitted anew: the one that a
-    jump widens takes a half for the whole."""
+    """A jump less the means in which it passes between the levels, with the drifts fitted anew: a drift that the jump
+    widens takes a half for the whole."""
     passing = []
     for time in candidate.theta:
         at = round(time / seen.dt)
@@ -656,7 +656,7 @@ def between_levels(seen: SeenAxes, candidate: Candidate) -> Candidate:
     return replace(beside(replace(seen, y=y), candidate), passing=tuple(passing))
 
 
-#: Causes whose shape is looked for once more with the drifts beside them: their family, and that look.
+#: Causes whose shape is looked for once more with the drifts fitted anew: their family, and that look.
 FIRMED = {"periodic": ("line", locked), "turn_on": ("transient", settled)}
 #: The searches; a jump's has the name of its cause.
 FAMILIES: dict[str, Callable[[SeenAxes], Iterator[Candidate]]] = {
@@ -679,8 +679,8 @@ def _best_of(found: Iterable[Candidate]) -> Candidate | None:
 
 @dataclass
 class Search:
-    """What was found so far: candidates of `several` axes, and those of one, which are left to it; the records less all
-    of them, `rest` [m, n], and the `model` of that."""
+    """What was found so far: candidates of `several` axes, and of a `single` axis, which are left to it; the records
+    less all of them, `rest` [m, n], and the `model` of that."""
 
     dt: float
     channels: Mapping[str, Array]
@@ -706,8 +706,8 @@ class Search:
         self.__dict__.pop("known", None)
 
     def go(self, least: float) -> None:
-        """Look until nothing is worth `least`, nats. A candidate with the pattern of the quantity in the model is that
-        one's own."""
+        """Look until nothing is worth `least`, nats. A candidate with the pattern of the quantity in the model is the
+        quantity's own."""
         vain: list[Candidate] = []
         firm: list[Candidate] = []
         turns = EVENTS_MOST - len(self.several) - len(self.single)
@@ -764,7 +764,7 @@ class Search:
 
     def weigh(self, model: Joint) -> None:
         """Take a model with the quantity. What goes like it over the axes is its own, or a channel that is looked for
-        again beside it: its wandering may go like a channel for a while."""
+        again with it: its wandering may go like a channel for a while."""
         alike = [candidate for candidate in self.several if candidate.share_of(model.loading) > OWN_SHARE_LEAST]
         self.rest = self.rest + sum(candidate.effect for candidate in alike)
         self.several = [candidate for candidate in self.several if not any(candidate is each for each in alike)]
@@ -778,7 +778,7 @@ def together(
     since_s: float = 0.0,
     apart: Mapping[str, Mask] = MappingProxyType({}),
 ) -> JointModule | None:
-    """What acts on several axes of one grid; None: there are too few axes or means to tell.
+    """What acts on several axes of a common grid; None: there are too few axes or means.
 
     `channels` [n]: temperature and supply. `apart` [n]: as a record has it. Before the quantity is
     weighed its wandering looks like events: those need be beyond doubt. With it in the model, or where it is not there,
@@ -801,7 +801,7 @@ def together(
         search.weigh(model)
     search.go(NAMED_NATS)
     of = None
-    if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
+    if model is not None:  # what an axis does alone is its drift's: without it the quantity would be too sure
         y = np.where(np.isfinite(search.rest), y, np.nan) - sum(candidate.effect for candidate in search.several)
         model = refitted(search.model, y, span)
         of = Hidden(tuple(found), model, y, scale, span).calm()
@@ -809,8 +809,8 @@ def together(
 
 
 def in_means(y: Array) -> tuple[Array, Mask, Array]:
-    """Means [m, n] in units of their noise less what jumps in one of them alone and lines beyond doubt, where those are
-    in the spectrum, and the units [m]."""
+    """Means [m, n] in units of their noise less spikes of a single mean and lines beyond doubt, where the lines are in
+    the spectrum, and the units [m]."""
     scale = np.array([np.nanstd(np.diff(row)) for row in y]) / math.sqrt(2.0)
     y = (y - np.nanmean(y, axis=1)[:, None]) / scale[:, None]
     whole = bridged_rows(y)
@@ -820,7 +820,7 @@ def in_means(y: Array) -> tuple[Array, Mask, Array]:
 
 @dataclass(frozen=True)
 class JointModule:
-    """What acts on several of the axes `names`: `events`, of means `dt` s long, and one quantity that nobody recorded
+    """What acts on several of the axes `names`: `events`, of means `dt` s long, and the quantity that nobody recorded
     or None. `scale` [m]: units of the search."""
 
     names: tuple[str, ...]
@@ -869,6 +869,6 @@ def calmed(states: Mapping[str, State], apart: Mapping[str, Mask]) -> dict[str, 
 
 
 def _root(rows: Array) -> Array:
-    """Of the covariance of noise [m, n]."""
+    """Root [m, m] of the covariance of noise [m, n]."""
     products = rows @ rows.T / max(1, rows.shape[1])
     return np.linalg.cholesky(products + 1e-6 * (np.trace(products) + 1e-300) * np.eye(len(rows)))

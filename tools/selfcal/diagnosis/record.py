@@ -1,4 +1,4 @@
-"""From a recording to the axes and side channels on one even grid."""
+"""The axes and side channels of a recording on a common even grid."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Record:
         return np.arange(self.present.size) / self.rate_hz
 
     def other_axes(self, axis: str) -> dict[str, Array]:
-        """The other axes about their level, bridged where missing or `apart`, less what the model lets this one leak
+        """The other axes about their level, bridged where missing or `apart`, less what the model lets this axis leak
         into them."""
         each = {name: self.calm(name, state.less_of(axis)) for name, state in self.axes.items() if name != axis}
         return {name: bridged(y) - float(np.nanmedian(y)) for name, y in each.items()}
@@ -227,7 +227,7 @@ def record_from(recording: Recording, model: Model, decimate: float | None = Non
 
 @dataclass(frozen=True)
 class _Axis:
-    """What a record has of one axis, as Record explains it."""
+    """What a record has of an axis, as Record explains it."""
 
     state: State
     readings: Readings
@@ -275,7 +275,7 @@ def _axis_of(
         return f"{usable} of its readings neither stick nor are clipped, a diagnosis needs {FEWEST} or more"
     moving = np.zeros(grid.n, bool)
     if readings.moving.any():
-        # A mean of which one sample moved is left out: the next ones may ring on below what is loud.
+        # A mean of which a sample moved is left out: the next samples may ring on below what is loud.
         cells = grid.cell_of(clock)[spread(readings.moving.astype(np.float64)) > 0.0]
         moving[cells[(cells >= 0) & (cells < grid.n)]] = True
     lattice = readings.lattice
@@ -333,13 +333,13 @@ def is_counter(record: Record, name: str) -> bool:
 
 
 def _varies(values: Array) -> bool:
-    """Whether not all values that are there are one."""
+    """Whether the values that are there differ."""
     there = values[np.isfinite(values)]
     return bool(there.size and np.ptp(there) > 0.0)
 
 
 def _beyond(values: Array, group: Group) -> str:
-    """What to say where readings [n] lie so far beyond the range that none counts. Empty elsewhere."""
+    """Complaint about readings [n] that lie so far beyond the range that no reading counts. Empty elsewhere."""
     most = BEYOND * group.range if group.range > 0.0 else math.inf
     if np.max(np.abs(values[np.isfinite(values)])) >= min(most, _library32.SAMPLE_MAX):
         return f"readings beyond {BEYOND:g} times the range of {group.range:g} {group.unit}: is the unit right?"

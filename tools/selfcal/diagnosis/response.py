@@ -32,9 +32,9 @@ SCHEMA = "selfcal.response/1"
 #: Samples that are looked at as they are; of more, means. More than the second number are refused: all columns of all
 #: time constants are in memory together.
 SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
-#: Records that the answer makes. Of 20 records the next one is within their range with 90 %.
+#: Records that the answer makes. The next record is within the range of 20 records with 90 %.
 RECORDS = 20
-#: Rounds in which each of several inputs is searched beside the others.
+#: Rounds in which each of several inputs is searched with the others.
 INPUT_ROUNDS = 2
 #: Quantiles of an interval.
 ENDS = tuple(0.5 + end * PROBABILITY / 2.0 for end in (-1.0, 0.0, 1.0))
@@ -60,7 +60,7 @@ WORDS = {
 
 def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
     """The input about its median, as it may act. The reading of another axis acts itself. What a channel reads acts:
-    behind its noise, and between the readings of a held one. The held readings may act themselves as well: a part that
+    behind its noise, and between its readings if held. The held readings may act themselves as well: a part that
     compensates by its own temperature."""
     if name in record.axes:
         acts = bridged(record.axes[name].y) + record.axes[name].level
@@ -96,9 +96,9 @@ def _about(given: Input) -> Input:
 
 
 def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str, tuple[dict[str, Any], Input]]:
-    """The answer to each input, beside the columns that the others act by, and the input as it acts likeliest. The one
-    that explains most alone comes first. Those that explain as much, and nothing beside each other, go together: each
-    is answered without the other, and neither is sure."""
+    """The answer to each input, with the columns that the others act by, and the input as it acts likeliest. The input
+    that explains most alone comes first. Inputs that explain as much, and nothing over each other, go together: each is
+    answered without the other, and neither is sure."""
     alone = {name: _best(state, each)[0] for name, each in inputs.items()} if len(inputs) > 1 else {}
     order = sorted(inputs, key=lambda name: -alone.get(name, 0.0))
     known: dict[str, Array] = {}
@@ -130,7 +130,7 @@ def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str,
 
 
 def _copies(given: Input, other: Input) -> bool:
-    """Whether one of two inputs is the other one times a factor, within the noise of its readings."""
+    """Whether either input is the other times a factor, within the noise of its readings."""
     for a, b in ((given, other), (other, given)):
         x, y = a.values - a.values.mean(), b.read - b.read.mean()
         noise = float(y @ (b.read - b.values)) / y.size  # the curve follows a part of it
@@ -301,7 +301,7 @@ def _estimate(pooled: Pooled, output: str, unit: str) -> dict[str, Any]:
 
 
 def _methods(state: State, drive: Drive, read: Array, chosen: Trial, pooled: Pooled, seen: Empirical) -> dict[str, Any]:
-    """Estimates of other methods beside an answer that is linear and has a static gain, and the step of their means."""
+    """Estimates of other methods, for an answer that is linear and has a static gain, and the step of their means."""
     if "gain" not in chosen.structure.keys or not chosen.structure.linear:
         return {}
     late_s = abs(float(np.median(pooled.each[0].delay_s)))

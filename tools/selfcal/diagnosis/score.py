@@ -1,8 +1,8 @@
-"""What a finding gains on held-out time: the evidence of the second half, each sample predicted from earlier ones only.
+"""What a finding gains on held-out time: the evidence of the second half, each sample predicted from the past only.
 
 The prediction is over the posterior that the earlier samples leave. Coefficients have the prior of an extended model
 file, the white noise has none. The drift's parameters are a sum over nodes that the whole record leaves possible.
-What no posterior covers is looked for anew in the first half (`Cause.trained`), if one axis alone shows it. A column
+What no posterior covers is looked for anew in the first half (`Cause.trained`), if a single axis shows it. A column
 that is nothing in the first half was chosen by what is scored, so the price of its search is charged.
 """
 
@@ -27,14 +27,14 @@ from selfcal.likelihood.statemodel import matrices
 
 #: Samples to score, and between the first and the last prediction, at least.
 SCORED_LEAST = 30
-#: The bias is a mean over so long, s.
+#: Length of the mean that is the bias, s.
 BIAS_S = 60.0
 
 
 @dataclass(frozen=True)
 class Cut:
     """The scored time: `edges` [pieces + 1], samples that count of each piece `sizes`, and places `marks` among which
-    the pieces lie, where the samples that are left `out` [n] of one model begin and end too: neither scores them."""
+    the pieces lie, where the samples that are left `out` [n] of either model begin and end too: neither scores them."""
 
     edges: Rows
     marks: Rows
@@ -50,8 +50,8 @@ class Cut:
 def gain(
     look: Look, before: State, after: State, record: Record, partner: State | None = None, *, located: bool = False
 ) -> HeldOut:
-    """What one finding gains. `partner`: the axis that shares the cause. `located`: several axes show its shape, which
-    the first half of one alone hardly does."""
+    """What a finding gains. `partner`: the axis that shares the cause. `located`: several axes show its shape, which
+    the first half of an axis alone hardly does."""
     cause = CAUSES[look.cause]
     if cause.score.no_gain:
         return HeldOut(None, cause.score.no_gain)
@@ -72,7 +72,7 @@ def gain(
     if cut is None:
         return HeldOut(None, "too few samples are left to score")
     if cause.score.together is not None and partner is not None:
-        # The joint log score of two axes less the other one's own is the first one's given the other.
+        # The joint log score of two axes less the other axis' own is the first axis' score given the other.
         old = _sequential(before, cut.marks, {})
         more, sd = cause.score.together(before.whitened, partner.whitened, before.dt, split, look.estimate)
         scores = cut.scores(old[0])
@@ -93,7 +93,7 @@ def gain(
 def _held_out(
     cut: Cut, before: Array, after: Array, sd: float, unit: str, ahead: Mapping[str, Mapping[str, float]]
 ) -> HeldOut:
-    """From the scores of the pieces."""
+    """The contract's `gain` from the scores of the pieces."""
     share = cut.sizes / cut.sizes.sum()
     entry = score_entry(float(before @ share), float(after @ share), sd, cut.sizes.sum())
     return HeldOut({**entry, "bias_rmse": {"unit": unit, "horizon_s": ahead}})
@@ -114,7 +114,7 @@ def _cut(before: State, after: State, split: int) -> Cut | None:
 
 
 def _horizons(dt: float, n: int, split: int) -> dict[float, Rows]:
-    """By horizon the samples from which the bias is predicted, where there are enough."""
+    """Samples from which the bias is predicted, for each horizon that has enough."""
     places = np.unique(np.linspace(split, n - 1, 300).astype(np.int64))
     found = {horizon: places[places <= n - _ahead(horizon, dt) - _window(dt)] for horizon in HORIZONS_S}
     return {horizon: each for horizon, each in found.items() if each.size and each[-1] - split >= SCORED_LEAST}
@@ -125,7 +125,7 @@ def _ahead(horizon: float, dt: float) -> int:
 
 
 def _window(dt: float) -> int:
-    """Samples of the mean that is the reading of a bias: one second."""
+    """Samples of the mean that is the reading of a bias: 1 s."""
     return max(1, round(1.0 / dt))
 
 
@@ -193,7 +193,7 @@ def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Se
 def _errors(
     state: State, old: Sequential, new: Sequential, horizons: Mapping[float, Rows]
 ) -> dict[str, dict[str, float]]:
-    """Root mean square of predicted minus read bias at each horizon; the reading is a mean of one second about it."""
+    """Root mean square of predicted minus read bias at each horizon; the reading is a mean of 1 s from there on."""
     window = _window(state.dt)
     found: dict[str, dict[str, float]] = {}
     for horizon, places in horizons.items():
@@ -211,7 +211,7 @@ def _mean(values: Array) -> float:
 
 
 def numbers(state: State) -> dict[str, float]:
-    """N, K and B of plain white noise and random walk fitted beside the model of a state, in the axis' unit; 0 where
+    """N, K and B of plain white noise and random walk fitted with the model of a state, in the axis' unit; 0 where
     the record shows none, of N where the walk takes all. B is that of the model's flicker noise, else by the minimum of
     the Allan deviation."""
     plain, best = next(fit for fit in state.fits if fit.terms.walk), state.best

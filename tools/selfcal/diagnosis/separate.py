@@ -1,8 +1,8 @@
-"""The next record that tells rivals apart: which channel to cycle, how far, and how long.
+"""The next record that distinguishes rivals: which channel to cycle, how far, and how long.
 
 A rival is a shape of the same axis. The first record leaves it a posterior: of the drift's size, of its numbers, and of
 its coefficients. Records of a planned length are drawn from the posterior of either rival, and both are scored by what
-they predict from the first record. The drift is free in this: a larger one swallows a part of what a rival lacks.
+they predict from the first record. The drift is free in this: a larger drift swallows a part of what a rival lacks.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from selfcal.likelihood.statemodel import Terms, matrices
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.forms import NUMBER, curved, formed, slope
 
-#: Evidence that the next record shall have for the rival that is true, nats, in which share of so many drawn records.
+#: Evidence that the next record shall have for the rival that is true, nats, in which share of how many drawn records.
 NATS, SHARE, DRAWN = 10.0, 0.9, 40
-#: Sizes of the drift over the one that is fitted without either rival: e to these.
+#: ln of the sizes of the drift over its fitted size without either rival.
 RIVAL_DRIFTS = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
-#: Samples in the time of the first record, and the length of the longest planned one over it.
+#: Samples in the time of the first record, and the length of the longest planned record over it.
 RECORD_SAMPLES, PLANNED_RATIO_MOST = 128, 4
 #: Places of a rival's numbers, about.
 RIVAL_PLACES = 9
@@ -75,7 +75,7 @@ def _planned(shape: Shape) -> bool:
 
 
 def _nested(a: Shape, b: Shape) -> bool:
-    """Whether one is a case of the other: no record is evidence against a coefficient that may be 0."""
+    """Whether either shape is a case of the other: no record is evidence against a coefficient that may be 0."""
     names = [{regressor.name for regressor in shape.regressors} for shape in (a, b)]
     return names[0] < names[1] or names[1] < names[0]
 
@@ -100,7 +100,7 @@ def _known(shape: Shape, state: State) -> RivalShape:
 
 
 def _shortest(a: RivalShape, b: RivalShape, state: State, record: Record) -> dict[str, Any]:
-    """The shortest record that tells two rivals apart, with the smallest cycle that suffices in the time of the first
+    """The shortest record that distinguishes two rivals, with the smallest cycle that suffices in the time of the first
     record. A cycle takes a quarter of that time or more: of faster changes the first record says little."""
     causes = {name: cause for cause, name in record.channel_names.items()}
     taken = {
@@ -209,7 +209,7 @@ def _drift(at: Fit, dt: float) -> tuple[Terms, Array, float]:
 
 
 def _differences(a: RivalShape, b: RivalShape, white: Array, ln_variance: Array) -> Array:
-    """Evidence for the true rival over the other one in the drawn records of `_drawn`, nats [2, DRAWN]."""
+    """Evidence for the true rival over the other in the drawn records of `_drawn`, nats [2, DRAWN]."""
     G = white.transpose(0, 2, 1) @ white
     ln_det = ln_variance.sum(axis=1) + np.log(G[:, 0, 0])
     G = G - G[:, :, :1] * G[:, :1, :] / G[:, :1, :1]  # less the bias

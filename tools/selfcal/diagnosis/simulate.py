@@ -70,7 +70,7 @@ def put_faults(
     random: _reference.Random,
 ) -> tuple[float, int] | None:
     """Put the faults of the bus and the logger into `values` [axes, n]. Returns the time of a change of the rate,
-    s, and how many readings make one from there on; None without."""
+    s, and how many values make a reading from there on; None without a change."""
     changed = None
     for effect in applied:
         spoil = CAUSES[effect["id"]].simulated.spoil
@@ -153,7 +153,7 @@ def truth_of(model: Model, seed: int) -> dict[str, dict[str, Any]]:
     for number, name in enumerate(model.axes):
         where = f"axes.{name}"
         fields = model.simulate["axes"].get(name, {})
-        # All are drawn, in one order, so that stating one leaves the others as they were.
+        # All are drawn, in a fixed order, so that stating a parameter leaves the others as they were.
         random = _reference.Random(seed, SEEDS + number)
         priors = model.group_of(name).priors
         law = _pick(model.hypotheses, random.uniform())
@@ -201,7 +201,7 @@ def axis_of(truth: Mapping[str, Any], group: Group, dt_s: float, block: int) -> 
 
 
 def applied_to(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_reference.Axis]) -> dict[str, Any]:
-    """Put one effect, ID[:key=value,...], into the scene. Returns what was applied, default values filled in."""
+    """Put an effect, ID[:key=value,...], into the scene. Returns what was applied, default values filled in."""
     name, *pairs = re.split("[:,]", text)
     known = [cause.id for cause in CAUSES.values() if cause.simulated.keys]
     if name not in known:

@@ -24,7 +24,7 @@ from selfcal.readings.lattice import WHITE_REMAINDERS
 BAND_RECORDS = 48
 #: Fewest simulated records that have a statistic.
 RECORDS_LEAST = 8
-#: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
+#: Least spread of a statistic with few possible values: an ensemble may show a single value.
 LEAST_SPREAD = {"longest_repeat": 0.25, "repeated_readings": 1.0, "commonest_reading": 1.0}
 #: Times at least that the drift forgets in a record in which jumps are looked for.
 FORGETS_LEAST = 50.0
@@ -42,7 +42,7 @@ LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144, 233, 377, 610, 987)
 
 @dataclass(frozen=True)
 class Statistic:
-    """One statistic: `measured`, the simulated 0.5 and 99.5 % points, and the probability `p` of one as extreme."""
+    """A statistic: `measured`, the simulated 0.5 and 99.5 % points, and the probability `p` of a value as extreme."""
 
     name: str
     measured: float
@@ -90,7 +90,7 @@ def all_statistics(w: Array, y: Array | None, lsb: float, jumps: Callable[[Array
 
 
 def _of_memory(filled: Array, present: Mask, n: int, lagged: Array) -> Iterator[tuple[str, float]]:
-    """Correlation of `n` residuals (missing: 0): `lagged` [lags] of single ones, of sums, and of Allan deviations."""
+    """Correlation of `n` residuals (missing: 0): `lagged` [lags] of each alone, of sums, and of Allan deviations."""
     for lag in LAGS:
         if lag < min(lagged.size, n // 8):
             yield f"innovation_lag{lag}", float(lagged[lag])
@@ -150,7 +150,7 @@ def _over_the_record(x: Array, filled: Array, present: Mask) -> dict[str, float]
 
 
 def _worst_band(power: Array, n: int, padded: int) -> dict[str, float]:
-    """The spectrum in thirds of an octave. `padded`: samples with the missing ones, `n` of them are there."""
+    """The spectrum in thirds of an octave. `padded`: samples with the missing samples, `n` of them are there."""
     worst: list[float] = []
     high = power.size - 1
     while high > 8:
@@ -168,12 +168,12 @@ def _of_readings(y: Array, lsb: float) -> dict[str, float]:
     """Readings `y` [n] that repeat, and how their codes on a lattice `lsb` are used."""
     # The codes of the lattice: sums in floating point differ in the last digit.
     codes = y if lsb <= 0.0 else np.rint((y - y[np.argmax(np.isfinite(y))]) / lsb)
-    # Readings that repeat the one before, beyond those that repeat an earlier one: these do by chance.
+    # Readings that repeat the reading before, beyond those that repeat an earlier reading: these do by chance.
     equal = [int((codes[k:] == codes[:-k]).sum()) for k in (1, 2, 3, 4)]
     usual = sum(equal[1:]) / 3.0
     found = {"repeated_readings": (equal[0] - usual) / math.sqrt(max(1.0, (sum(equal) / 3.0)))}
     if lsb <= 0.0:
-        # Without a lattice, or on one of several steps, no reading is much commoner than the next.
+        # Without a lattice, or on a lattice of several steps, no reading is much commoner than the next.
         _, counts = np.unique(y[np.isfinite(y)], return_counts=True)
         first, second = np.sort(counts)[:-3:-1] if counts.size > 1 else (counts[0], 0)
         found["commonest_reading"] = float(first - second) / math.sqrt(float(first + second)) if sum(equal) else 0.0
@@ -274,7 +274,7 @@ def _largest(x: Array) -> float:
 
 
 def simulated(state: State, random: np.random.Generator) -> Array:
-    """One record of the fitted model, read out as the recording: gaps, lattice, limits, a counter's increments."""
+    """A record of the fitted model, read out as the recording: gaps, lattice, limits, a counter's increments."""
     fit = state.best
     n = state.y.size
     if fit.quantized:  # the counter makes what remembers
@@ -311,7 +311,7 @@ def _counted(y: Array, fit: Fit, random: np.random.Generator, *, means: bool) ->
 
 def states_of(m: Matrices, level: Array, random: np.random.Generator) -> Array:
     """h x over n steps; `level` [n] scales white noise with memory. In the coordinates of F the states are processes of
-    the first order, each filtered by itself. A moving average has none: e_i and e_(i-1)."""
+    the first order, each filtered by itself. A moving average has no such process: e_i and e_(i-1)."""
     from scipy.signal import lfilter
 
     e = _half(m.Q) @ random.standard_normal((len(m.F), level.size))
@@ -430,8 +430,8 @@ def _ln_tails(values: Array, sample: Array, least: Array, *, own: bool = False) 
 
 
 def _family(ln_p: Array, sample: Array, least: Array) -> float:
-    """Probability that the most striking of all is as striking by chance: by the simulated records' own most striking
-    ones, each judged by the others, and an exponential tail beyond those."""
+    """Probability that the most striking of all is as striking by chance: by each simulated record's own most striking
+    statistic, judged by the other records, and an exponential tail beyond those."""
     chance = np.sort(-_ln_tails(sample, sample, least, own=True).min(axis=1))
     top = chance[round((1.0 - TAIL) * chance.size) :]
     beyond = -float(ln_p.min()) - float(top[0])

@@ -1,4 +1,4 @@
-"""What a diagnosis would most likely name first: one round of looks, without the search for integrity and the rest."""
+"""What a diagnosis would most likely name first: a round of looks, without the search for integrity and the rest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from selfcal.model.tables import bank_block, make_tables
 
 
 def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[str, Look]:
-    """By axis the look that gains most on means of 1 s. Axes that show none, or are too short, are left out.
+    """The look of each axis that gains most on means of 1 s. Axes without a look, or too short, are left out.
 
     The fits are rough: they rank causes, and their sizes lay a prior at most."""
     try:
@@ -41,7 +41,7 @@ def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[
 
 
 def rough(recording: Recording, model: Model, axes: Sequence[str]) -> tuple[Record, dict[str, State]]:
-    """Means of SLOW_S, or MOST_INTERVALS longer ones, and a rough fit of each of the axes that can be judged, less the
+    """Means of SLOW_S, or MOST_INTERVALS longer means, and a rough fit of each of the axes that can be judged, less the
     motion. Raises UserError for a record that is too short."""
     record = record_from(recording, model, min(1.0 / SLOW_S, recording.rate_hz, MOST_INTERVALS / recording.duration_s))
     states = {name: record.axes[name] for name in axes if name in record.axes and not record.axes[name].below_lattice}
@@ -64,8 +64,8 @@ def with_added_laws(
 ) -> list[str]:
     """Identify axes anew whose suspicion is noise of another kind than white: N of the default laws is wrong there.
 
-    The law of that noise joins the default ones. Where it is the likeliest, its answer takes the place of the first
-    one, with `added_law` and the suspicion. Returns those axes."""
+    The law of that noise joins the default laws. Where it is the likeliest, its answer takes the place of the first
+    answer, with `added_law` and the suspicion. Returns those axes."""
     from selfcal.diagnosis.causes import CAUSES
 
     again = []
@@ -91,7 +91,7 @@ def with_added_laws(
 
 def _whole_means(recording: Recording, bank_rate_hz: float) -> Recording:
     """The recording without the bank intervals that lost readings: what a counter gained there is in no other reading.
-    Raises UserError where none is left."""
+    Raises UserError where fewer than FEWEST are left."""
     if not recording.missing_before.any():
         return recording
     block = bank_block(recording.rate_hz, bank_rate_hz)
@@ -104,9 +104,9 @@ def _whole_means(recording: Recording, bank_rate_hz: float) -> Recording:
 
 
 def weigh_more_laws(document: dict[str, Any], recording: Recording, names: Sequence[str]) -> None:
-    """What the laws of `models/sums.yaml` say of the axes whose drift the default ones do not describe, beside them.
+    """Add the answer of the laws of `models/sums.yaml`, for the axes whose drift the default laws do not describe.
 
-    At the model's own bank rate; of a longer record than MORE_LAWS_MOST such intervals at a lower one."""
+    At the model's own bank rate; at a lower rate for a longer record than MORE_LAWS_MOST such intervals."""
     from selfcal.bank.library import Bank
     from selfcal.diagnosis.causes import CAUSES
 

@@ -1,6 +1,6 @@
 """A damped oscillator that white noise drives, of any period: x'' + 2 damping w x' + w^2 x = white noise, w = 2 pi / P.
 
-A slow one is the drift's (causes/oscillation.py), a fast one a band (causes/periodic.py). The drift swallows slow
+A slow swing is the drift's (causes/oscillation.py), a fast swing a band (causes/periodic.py). The drift swallows slow
 swings: the innovations are looked at behind smaller drifts as well. A smoothed periodogram of these shows the period
 and the damping from which all is fitted.
 """
@@ -21,15 +21,15 @@ from selfcal.likelihood.state import State, net
 from selfcal.likelihood.statemodel import PERIOD_LIMITS
 from selfcal.model.laws import DAMPING_LIMITS, SWING_LEAST
 
-#: Turns in a record at least.
+#: Least turns in a record.
 SWING_TURNS_LEAST = 3.0
 #: Drifts behind which slow swings are looked for: smaller by exp(-these).
 SWING_DRIFTS = (0.0, 1.5, 4.0)
 #: Widths of a mean of the periodogram, bins. Half the width of a band is this share of the mean that shows it.
 MEAN_BINS, HALF_WIDTH_SHARE = tuple(2**k for k in range(1, 10)), 0.3
-#: Above this damping a fast band is coloured or flicker noise.
+#: Damping above which a fast band is coloured or flicker noise.
 DAMPING_MOST = 0.25
-#: Swings that one model may have beside a slow one.
+#: Most swings that a model may have besides a slow swing.
 SWINGS_MOST = 5
 #: ln of the bins of the spectrum less this is the price of a search: by 800 clean records at 1 and 10 Hz, of swings
 #: that forget their phase.
@@ -38,7 +38,7 @@ LN_FEWER = 4.4
 
 @dataclass(frozen=True)
 class Swing:
-    """A swing with its fits beside every near drift: its gain, and that `net` of the search."""
+    """A swing with its fits for every near drift: its gain, and that `net` of the search."""
 
     fits: tuple[Fit, ...]
     gain: float
@@ -62,7 +62,7 @@ class Swing:
 
 
 def found(state: State, *, slow: bool) -> Swing | None:
-    """The swing that promises most, the drift fitted with it, if it is worth one nat. None where it cannot be named: a
+    """The swing that promises most, the drift fitted with it, if it is worth 1 nat. None where it cannot be named: a
     fit adds no more than a drift of two terms alone gains, and FIT_ADDS."""
     n, span = state.y.size, state.y.size * state.dt
     border = span / max(PERIOD_LIMITS[0], SWING_LEAST * state.dt)
@@ -89,7 +89,7 @@ def _search(
     state: State, low: float, high: float, sizes: Sequence[float], most: float
 ) -> tuple[dict[str, float], float, float] | None:
     """ln of period, damping and size of the likeliest swing of `low` to `high` turns and a damping of `most`, by how
-    much the drift beside it is smaller, and its gain before a fit. Each mean of the periodogram has its best place; of
+    much the drift with it is smaller, and its gain before a fit. Each mean of the periodogram has its best place; of
     these the filter finds the likeliest."""
     n, fit = state.y.size, state.best
     place = np.arange(n // 2 + 1)

@@ -34,15 +34,15 @@ Point = tuple[float, ...]
 PROBABILITY = 0.9
 #: ln of the stiffness of a curve through an input's readings, least and most; fewer readings are taken as they are.
 STIFF, ROUGH = (-10.0, 25.0), 30
-#: Factors between a filter's numbers that are tried first, beside 2.
+#: Factors between a filter's numbers that are tried first; 2 for the others.
 COARSE = {"pure_delay_s": 1.6, "damping": 3.0}
 #: Draws of a posterior.
 DRAWS = 4000
-#: Price of a number of a structure beside half BIC, nats: several structures have one more than a lag, each another.
+#: Price of a number of a structure besides half BIC, nats: several add a number to a lag, each a different number.
 LN_CHOICE = 1.0
 #: ln of the number of independent looks: the structures and their numbers.
 LN_STRUCTURES = math.log(42.0)
-#: Structures within so many nats of the best are scored beside a drift of two terms.
+#: Nats from the best within which structures are scored with a drift of two terms.
 NEAR_NATS = 10.0
 #: Tapers of the empirical spectra, their half bandwidth in bins, and the bands of a decade.
 SPECTRUM_TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 3, 2.5, 8
@@ -53,8 +53,8 @@ CORNER = 20.0
 
 @dataclass(frozen=True)
 class Input:
-    """An input: `values` [n] about its `reference` in `unit`, of the readings `read` [n]. `held_s`: from one reading of
-    a held input to the next, `taken` in words as which its readings were taken."""
+    """An input: `values` [n] about its `reference` in `unit`, of the readings `read` [n]. `held_s`: time between the
+    readings of a held input, s; `taken`: in words as which its readings were taken."""
 
     values: Array
     read: Array
@@ -75,7 +75,7 @@ class Structure:
 
     @property
     def poles(self) -> int:
-        """Its order."""
+        """Order of the structure."""
         return len(set(self.shape) - {"pure_delay_s", "width", "window_s"})
 
     @property
@@ -183,7 +183,7 @@ class Drive:
         return np.array([known.get(name, lag) for name in structure.shape]).reshape(-1, 2)
 
     def points(self, structure: Structure) -> list[Point]:
-        """Those that are tried first."""
+        """Points that are tried first."""
         grids = []
         for name, (low, high) in zip(structure.shape, self.limits(structure), strict=True):
             count = 2 + int(math.log(high / low) / math.log(COARSE.get(name, 2.0)))
@@ -210,9 +210,9 @@ class Drive:
 
 
 def quiet(values: Array, lattice: float = 0.0) -> Array:
-    """[n]: what readings [n] with a noise of their own are of: a walk or an integrated one, whichever the readings tell
-    with its size (the splines of Wahba, 1978). What it leaves of the noise does not go with it, and so it biases no
-    gain. On a `lattice` the noise is that of rounding at least: between its steps readings look exact."""
+    """[n]: the curve that readings [n] with a noise of their own are of: a walk or an integrated walk, whichever the
+    readings show, with its size (the splines of Wahba, 1978). What it leaves of the noise does not go with it, and so
+    it biases no gain. On a `lattice` the noise is that of rounding at least: between its steps readings look exact."""
     n = values.size
     about = values - values.mean()
     if n < ROUGH or not np.any(np.diff(values, 2)):
@@ -234,7 +234,7 @@ def quiet(values: Array, lattice: float = 0.0) -> Array:
         root = cholesky_banded(stiff)
         curve = cho_solve_banded((root, False), about)
         left = max(float(about @ (about - curve)), 1e-300)
-        # Twice the second term is ln det D D': of a walk n, of an integrated one n^2 (n^2 - 1) / 12.
+        # Twice the second term is ln det D D': of a walk n, of an integrated walk n^2 (n^2 - 1) / 12.
         scale = 0.5 * math.log(n if order == 1 else n**2 * (n**2 - 1.0) / 12.0)
         return 0.5 * (n - order) * (math.log(left) - ln_stiff) - scale + float(np.log(root[order]).sum()), curve
 
@@ -256,7 +256,7 @@ def quiet(values: Array, lattice: float = 0.0) -> Array:
 
 
 def late(values: Array, lag_s: complex, dt: float) -> NDArray[Any]:
-    """[n]: `values` [n] behind a first-order lag, at rest at the first one; of a complex time constant it is complex.
+    """[n]: `values` [n] behind a first-order lag, at rest at the first value; complex for a complex time constant.
 
     Exact for samples between which the input moves on straight lines, and for means over each interval of an input that
     is constant there. A module's lag takes each sample for the whole interval before it: half an interval less."""
@@ -316,7 +316,7 @@ def tried(state: State, drive: Drive, structure: Structure) -> Trial:
 
 
 def beside_two_terms(state: State, found: Sequence[Trial]) -> list[Trial]:
-    """The structures with scores beside a drift of two terms, and the fit with that drift where it is clearly better.
+    """The structures with scores for a drift of two terms, and the fit with that drift where it is clearly better.
 
     A drift of one term that follows quick errors of a structure leaves slow columns some nats of their own."""
     if state.extras.all_scales:
@@ -343,7 +343,7 @@ def worth(state: State, trial: Trial) -> float:
 
 
 def posterior(state: State, drive: Drive, trial: Trial) -> Draws:
-    """Draws over coefficients, the filter's numbers, and the drift: every near one, and its parameters."""
+    """Draws over coefficients, the filter's numbers, and the drift: every near drift, and its parameters."""
     structure = trial.structure
     drifts = [
         (fit, theta, ln_share + _flat(fit, theta)) for fit, theta, ln_share in state.possible(trial.columns, rich=True)
@@ -416,9 +416,9 @@ def held_out(state: State, trial: Trial) -> float:
 def left_over(state: State, drive: Drive, trial: Trial) -> float:
     """-ln p of residuals that still go with the input, net of the number of looks.
 
-    At any frequency in any phase, so whatever the lag, and with one coefficient: with each column of the structure, the
-    input itself, powers of what the filter makes of it, a coefficient that changes with time, and a filter that is
-    quicker up than down."""
+    At any frequency in any phase, so whatever the lag, and with a single coefficient: with each column of the
+    structure, the input itself, powers of what the filter makes of it, a coefficient that changes with time, and a
+    filter that is quicker up than down."""
     number = trial.structure.named(trial.point)
     v = behind(drive.u, drive.dt, number)[0]
     uneven = behind(np.abs(drive.u - v), drive.dt, number)[0]
@@ -436,7 +436,7 @@ def left_over(state: State, drive: Drive, trial: Trial) -> float:
 def source(
     state: State, drive: Drive, trial: Trial, drawn: Draws, misfits: Sequence[str], *, acts_back: bool
 ) -> tuple[str, str]:
-    """Whether the record tells that the input acts: "input first", "cannot tell" or "no structure", and the reason in
+    """Whether the record shows that the input acts: "input first", "cannot tell" or "no structure", and the reason in
     words. `misfits`: what contradicts the structure. `acts_back`: the output may act on the input. No axis acts on a
     temperature or a supply.
 

@@ -1,7 +1,7 @@
 """Warm start: what `diagnose` measured of a part becomes the prior of this part's module.
 
-The next rest of the part is another one: at another temperature, after another start. Its parameter differs from this
-record's by RUN_TO_RUN, sd of the logarithm, beside what the record leaves open. The prior is log-uniform within
+The next rest of the part differs: at another temperature, after another start. Its parameter differs from this record's
+by RUN_TO_RUN, sd of the logarithm, besides what the record leaves open. The prior is log-uniform within
 PRIOR_REACH times both together, and so WIDENED times as wide as both. A coefficient's prior is normal and as wide.
 """
 
@@ -32,7 +32,7 @@ WIDENED = PRIOR_REACH / math.sqrt(3.0)
 #: temperature.
 RUN_TO_RUN = {"N": 0.05, "K": 0.2, "sigma_m": 0.2, "B": 0.2}
 RUN_TO_RUN_COEFFICIENT = 0.1
-#: Most ln odds of a regressor: one that is faint may be in use in the next record, and one that is sure may not.
+#: Most ln odds of a regressor: a faint regressor may be in use in the next record, and a sure regressor may not.
 MOST_LN_ODDS = math.log1p(-LAW_LEAST) - math.log(LAW_LEAST)
 #: How far rounding takes a sum of probabilities beyond 1: the bank reports floats.
 SUM_ROUNDING = MOST_HYPOTHESES * float(np.finfo(np.float32).eps)
@@ -40,7 +40,7 @@ SUM_ROUNDING = MOST_HYPOTHESES * float(np.finfo(np.float32).eps)
 
 @dataclass(frozen=True)
 class AxisStart:
-    """One axis, in the model's unit. `limits`: ln limits by law and parameter. `coefficients`: mean and sd by column.
+    """An axis, in the model's unit. `limits`: ln limits by law and parameter. `coefficients`: mean and sd by column.
     `ln_odds` that a regressor is in use, by its name."""
 
     limits: Mapping[str, Mapping[str, tuple[float, float]]]
@@ -56,7 +56,7 @@ class Start:
     axes: Mapping[str, AxisStart]
 
     def applied(self, tables: Tables) -> Tables:
-        """The tables with these priors. An axis that the diagnosis has not keeps the model's."""
+        """The tables with these priors. An axis that the diagnosis lacks keeps the model's."""
         known = [self.axes.get(axis.name) for axis in tables.axes]
         return replace(
             tables,
@@ -66,7 +66,7 @@ class Start:
 
 
 def warmed(tables: Tables, start: Start | None) -> Tables:
-    """The tables with the priors of a start, if there is one."""
+    """The tables with the priors of a start, if any."""
     return tables if start is None else start.applied(tables)
 
 
@@ -98,7 +98,7 @@ def _regressor(column: RegressorTable, known: list[AxisStart | None]) -> Regress
 
 
 def load_start(path: Path | str, model: Model) -> Start:
-    """Read the file that `diagnose --json` writes. Raises UserError for any other, and for one of another model."""
+    """Read the file that `diagnose --json` writes. Raises UserError for any other file, and for another model's."""
     return _Reader(Path(path), model).start()
 
 

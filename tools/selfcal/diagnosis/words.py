@@ -46,7 +46,7 @@ LABELS = {
     "ratio": "times the noise",
     "turn_on": "turn-on transient",
 }
-#: What a form adds to the sentence; the static one is what the sentence says by itself.
+#: Words that a form adds to the sentence, which by itself describes the static form.
 FORMS = {
     "lag": "late by a first-order lag",
     "rate": "by its rate",
@@ -103,7 +103,7 @@ G_SENSITIVITY = 0.02
 
 
 def rounded(value: float, half: float) -> str:
-    """A value to the second digit of its uncertainty; 6 digits without one."""
+    """A value to the second digit of its uncertainty; 6 digits without an uncertainty."""
     if not (half > 0.0 and math.isfinite(half) and value != 0.0):
         return f"{value:.6g}"
     first = math.floor(math.log10(abs(value)))
@@ -184,7 +184,7 @@ def event(finding: Mapping[str, Any]) -> str:
 
 
 def named(cause: str) -> str:
-    """A cause by its name, or the id of one of several."""
+    """A cause by its name, or by the id of an event, such as `periodic_2`."""
     of_several, _, number = cause.replace(" ", "_").rpartition("_")
     label = LABELS.get(cause, cause.replace("_", " ")) if cause != "misread" else cause  # the label is of a size
     return f"{named(of_several)} {number}" if number.isdecimal() else label
@@ -203,7 +203,7 @@ def what(finding: Mapping[str, Any]) -> str:
 
 
 def how_much(finding: Mapping[str, Any]) -> str:
-    """Its leading size on each axis; one without a unit by its name."""
+    """Leading size of a finding on each axis; a size without a unit by its name."""
     found = []
     for axis, on_axis in finding["axes"].items():
         key, value = next(((k, v) for k, v in on_axis["estimate"].items() if isinstance(v, Mapping)), ("", None))
@@ -235,7 +235,7 @@ def _range(values: Sequence[float]) -> str:
 
 def _off(factors: Sequence[float]) -> str:
     """How far a number is off, by its values without a cause over those with it: in percent up to twice or half. It is
-    not identified without the cause where a factor is infinite, and hidden where one is 0."""
+    not identified without the cause where a factor is infinite, and hidden where a factor is 0."""
     told = []
     above, below = [f for f in factors if 1.0 < f < math.inf], [1.0 / f for f in factors if 0.0 < f < 1.0]
     for word, own in (("large", above), ("small", below)):
@@ -295,7 +295,7 @@ def action(finding: Mapping[str, Any]) -> str:
 
 
 def planned(record: Mapping[str, Any] | None, else_: str) -> str:
-    """The next record in words; without one the advice of the cause."""
+    """The next record in words; without a plan the advice of the cause."""
     if record is None:
         return else_
     rivals = " and ".join(map(named, record["between"]))
@@ -320,7 +320,7 @@ def _sure(coefficient: Mapping[str, Any] | None) -> bool:
 
 
 def small(findings: Sequence[Mapping[str, Any]]) -> str:
-    """One line on the findings that matter little: they move no number by more than it is known."""
+    """A line on the findings that matter little: they move no number by more than it is known."""
     several = len(findings) > 1
     count = f"{len(findings)} small findings" if several else "1 small finding"
     causes: dict[str, list[str]] = {}
@@ -346,7 +346,7 @@ def evidence(finding: Mapping[str, Any], number: Callable[[float], str] = "{:.1f
 
 
 def carried(finding: Mapping[str, Any]) -> list[str]:
-    """The gain of a finding on a second recording, in a line; no line without one."""
+    """The gain of a finding on a second recording, in a line; no line without a second recording."""
     if finding.get("gain_on"):
         score = finding["gain_on"]["log_score_per_sample"]
         more = score["after"] - score["before"]
@@ -358,7 +358,7 @@ def carried(finding: Mapping[str, Any]) -> list[str]:
 
 
 def navigation(document: Mapping[str, Any]) -> list[str]:
-    """What the findings mean for a GPS/INS filter, a line each, and what that rests on; none where nobody asked."""
+    """What the findings mean for a GPS/INS filter, a line each, and what that rests on; no line unless asked."""
     if "navigation" not in document:
         return []
     lines = [

@@ -1,1 +1,1 @@
-"""Filters and fits of one axis."""
+"""Filters and fits of an axis, and of all axes together."""

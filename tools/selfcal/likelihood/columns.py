@@ -1,8 +1,8 @@
-"""One engine for columns x(t; theta) beside a drift: search, choice of a form, sizes, and the smallest size shown.
+"""Engine for columns x(t; theta) with a drift: search, choice of a form, sizes, and the smallest size shown.
 
 A family states its shapes: forms of a column, the simplest first, each over a grid of its numbers theta. A drift
 swallows a slow column, so that its score is too small at the drift fitted without it. Shapes are ranked at smaller
-drifts as well; the best of each form is fitted with the drift beside it, and all are ranked again at that drift.
+drifts as well; the best of each form is fitted together with the drift, and all are ranked again at that drift.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ from selfcal.likelihood.state import (
     normal_entry,
 )
 
-#: A drift that is known from few of its own turns leaves slow columns a longer tail. Of 2267 clean axes at 1 and 10 Hz
-#: 7 showed 7 nats of a supply or a temperature and 2 of a ramp at a price of 0.8, where 4 and 2 were due; the tail ran
-#: on to 10.2. With 1.8 two show 7.6 of any.
+#: Price added to slow columns, nats: a drift known from few of its own turns leaves them a longer tail. At 0.8, of 2267
+#: clean axes at 1 and 10 Hz 7 showed 7 nats of a supply or a temperature and 2 of a ramp, where 4 and 2 were due; the
+#: tail ran on to 10.2. At 1.8, two axes show 7.6 nats of any slow column.
 LN_SLOW = 1.8
 #: ln of the number of looks of a choice of two.
 LN_EITHER = math.log(2.0)
-#: Drifts at which shapes are ranked beside the fitted one: its size over e to these. The last is for slow shapes alone.
+#: ln factors by which the fitted drift is made smaller to rank shapes again. The last is for slow shapes alone.
 SMALLER = (1.5, 3.0)
-#: Forms of a family, or events of a search, that are fitted: those that rank best. After the first one only forms whose
-#: score is within so many nats, and this share of the best, of what a form needs to be taken, or to be as likely.
+#: Most forms of a family, or events of a search, that are fitted: those that rank best. After the first, a form's score
+#: may lack these nats, plus this share of the best, of the worth that names a form, or makes it as likely.
 FITTED, FIT_ADDS, FIT_SHARE = 3, 3.0, 0.05
-#: Numbers between those of the grid: steps of their logarithms, the first and the last.
+#: First and last step of the logarithms of numbers, in the search between nodes of the grid.
 STEP_FIRST, STEP_LAST = 0.35, 0.005
-#: Worth from which on a shape may be named, or be as likely as the one that is, nats.
+#: Least worth, nats, of a shape that may be named, or be as likely as the named shape.
 NEARLY = NET_LEAST - ALIKE
-#: A number's posterior is on a lattice of such steps, standard deviations, as far as ln likelihood is this much lower,
-#: with so many nodes at most. How far off the standard deviation is looked for first, and how often.
+#: Lattice of a number's posterior: step in standard deviations, largest fall of ln likelihood, and most nodes. First
+#: offset at which the standard deviation is sought, and most tries.
 NODE, POSSIBLE_NATS, NUMBER_NODES_MOST, REACH_FIRST, REACHES = 0.5, 7.0, 500, 0.01, 10
 
 
 @dataclass(frozen=True)
 class Number:
-    """One number of a shape, above 0: its key in the estimate, its unit, and between what it is looked for. A number
-    that is a share `of` another one has that in its value and limits, and in the estimate their product."""
+    """A number of a shape, above 0: its key in the estimate, its unit, and the limits of its search. If the number is a
+    share `of` another number, value and limits are the share, and the estimate is their product."""
 
     key: str
     value: float
@@ -66,20 +66,19 @@ class Number:
 
 @dataclass(frozen=True)
 class Shape:
-    """The columns of a family at one theta.
+    """The columns of a family at a theta.
 
     columns     [k, n]: those whose coefficients are the estimate's, `keys` with their units.
     regressors  the same space as columns of the model file.
     price       ln of the number of independent looks of its search, or that by the gain.
     free        degrees of freedom of its gain.
     numbers     theta, and `moved`, the shape at other numbers.
-    sharper     the best shape beside a fit, in the place of a search among other numbers.
+    sharper     the best shape at a fit, in the place of a search among other numbers.
     where       when or at which frequency it is, by its fit; `when` of a Look.
-    stated      what the estimate says beside.
+    stated      further entries of the estimate.
     measure     its posterior, of a family that knows more of it than `measured` does.
     whole       of a shape in means: the same at every sample.
-
-    Fewer keys than columns: the last one is the norm of the next two coefficients, sine and cosine of a line.
+    waves       coefficients whose norm is the last key, sine and cosine of a line; 0: each key is a coefficient.
     """
 
     form: str
@@ -96,9 +95,10 @@ class Shape:
     measure: Callable[[State], Mapping[str, Any]] | None = None
     stated: Mapping[str, Any] = field(default_factory=dict)
     whole: Shape | None = None
+    waves: int = 0
 
     def in_means(self, block: int) -> Shape:
-        """The shape in means of so many samples."""
+        """The shape in means of `block` samples."""
         moved, sharper = self.moved, self.sharper
         return replace(
             self,
@@ -117,7 +117,7 @@ class Shape:
         return net(gain, self.free, self.price(gain) if callable(self.price) else self.price)
 
     def told(self, thetas: Array) -> dict[str, Array]:
-        """What the estimate says of the numbers [..., m], by key."""
+        """Values of the numbers [..., m] in the estimate, by key."""
         values = {number.key: thetas[..., k] for k, number in enumerate(self.numbers)}
         return {number.key: values[number.key] * values.get(number.of, 1.0) for number in self.numbers}
 
@@ -134,7 +134,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Tried:
-    """A shape with what it gains and the fit beside it."""
+    """A shape, its gain, and the fit with it."""
 
     shape: Shape
     gain: float
@@ -146,7 +146,7 @@ class Tried:
 
 
 def fitted(state: State, shape: Shape) -> Tried:
-    """A shape with the drift fitted beside it."""
+    """A shape, with the drift refitted."""
     return Tried(shape, *state.with_columns(shape.columns))
 
 
@@ -233,8 +233,7 @@ def alike(found: Mapping[str, Tried]) -> list[Tried]:
 def looks(
     state: State, cause: str, shapes: Sequence[Shape], dearer: Iterable[Shape] = (), *, slow: bool = True
 ) -> list[Look]:
-    """The look at a family, where it is worth one nat. `dearer`: forms that are tried where a first one may be
-    named."""
+    """The look at a family, if worth 1 nat. `dearer`: forms that are tried only if a cheaper form may be named."""
     found = tried(state, shapes, slow=slow)
     if any(trial.net > NEARLY for trial in found.values()):
         found |= tried(state, list(dearer), slow=slow)
@@ -260,7 +259,7 @@ def look(state: State, cause: str, chosen: Tried) -> Look:
 
 
 def _estimate(chosen: Tried) -> dict[str, Any]:
-    """As the fit has it: its coefficients, and the best numbers alone."""
+    """Estimate of the fit: its coefficients, and the best numbers alone."""
     shape, fit = chosen.shape, chosen.fit
     k = len(shape.columns)
     c, sd = _sizes(shape, fit.c[-k:], fit.sd[-k:])
@@ -272,10 +271,10 @@ def _estimate(chosen: Tried) -> dict[str, Any]:
 
 def _sizes(shape: Shape, c: Array, sd: Array) -> tuple[Array, Array]:
     """Coefficients [..., columns] and their deviations as the keys have them."""
-    last = len(shape.keys) - 1
-    if last + 1 == len(shape.columns):
+    if not shape.waves:
         return c, sd
-    own = slice(last, last + 2)
+    last = len(shape.keys) - 1
+    own = slice(last, last + shape.waves)
     norm, mean = np.linalg.norm(c[..., own], axis=-1, keepdims=True), sd[..., own].mean(axis=-1, keepdims=True)
     return np.concatenate([c[..., :last], norm], axis=-1), np.concatenate([sd[..., :last], mean], axis=-1)
 
@@ -286,7 +285,7 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
     points, steps = possible(state, shape)
     shapes = [shape, *(shape.near(np.exp(points)) if shape.numbers else [])]
     weight, means, sds = state.posterior(*(shape.columns for shape in shapes))
-    if shape.numbers:  # the first one is on the lattice as well
+    if shape.numbers:  # the lattice has the first shape as well
         weight, means, sds = weight[1:], means[1:], sds[1:]
     means, sds = _sizes(shape, means, sds)
     found = {
@@ -301,7 +300,7 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
 
 
 def possible(state: State, shape: Shape) -> tuple[Array, Array]:
-    """As `number_nodes`, of a shape's numbers beside the drift that is fitted with it."""
+    """`number_nodes` of a shape's numbers, at the drift that is fitted with it."""
     if not shape.numbers:
         return np.empty((1, 0)), np.empty((0, 0))
     fit = fitted(state, shape).fit
@@ -318,7 +317,7 @@ def number_nodes(scores: Callable[[Array], Array], start: Sequence[float], limit
     limits, m = np.log(limits), len(limits)
     if not m:
         return np.empty((1, 0)), np.empty((0, 0))
-    middle = np.clip(np.log(start), *limits.T)  # the limits of one number may follow another
+    middle = np.clip(np.log(start), *limits.T)  # the limits of a number may follow another
     best = scores(np.exp(middle)[None])[:, 0]
     reach, steps = np.full(m, REACH_FIRST), np.eye(m)
     for _ in range(REACHES):

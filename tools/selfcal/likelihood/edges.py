@@ -1,4 +1,4 @@
-"""A level that changes at one place or at two: every place of an edge in one pass of the filter, the other one held."""
+"""A level that changes at one place or at two: every place of an edge in a pass of the filter, the other edge held."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from selfcal.likelihood.columns import LN_SLOW, Shape
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
 from selfcal.likelihood.state import FittedColumn, State, ln_looks, mixture, net, normal_entry
 
-#: Least share of its information that a step keeps beside the level before it; and the least share of a mid-record
+#: Least share of its information that a step keeps with the level before it; and the least share of a mid-record
 #: step's information at the last place that is looked at.
 STEP_SHARE_LEAST = 0.05
-#: A drift that forgets more often than this in the record gives way to a step: its size is fitted anew beside it, and
-#: noise alone gains as two coefficients do. Of 683 clean records at 1 Hz 17 instead of 4.6 showed 5 nats with one.
+#: Turns of a drift in the record above which it gives way to a step: its size is fitted anew with the step, and noise
+#: alone gains as two coefficients do. Counted as one, 17 of 683 clean records at 1 Hz showed 5 nats instead of 4.6.
 FORGETS = 5.0
-#: Samples between two edges at least: a shorter pulse is outliers'. Samples at the ends where no edge of one lies.
+#: Least samples between two edges: a shorter pulse is outliers'. Samples at the ends where no edge of a pulse lies.
 EDGES_APART, EDGE = 10, 4
-#: Places with less than e^-8 of the best one's likelihood between them are two steps'. Places of the posterior that
-#: hold less than the second are left out, and beyond so many the least likely.
+#: Fall of ln likelihood between two places that makes them two steps. Least likelihood of a place of the posterior,
+#: over the best place, and most places: beyond, the least likely are left out.
 VALLEY, WEIGHT_LEAST, MOST_PLACES = 8.0, 1e-7, 1600
 #: Keys of the model file's entry, by the number of edges.
 KEYS = {1: ("time_s",), 2: ("start_s", "end_s")}
@@ -32,8 +32,8 @@ KEYS = {1: ("time_s",), 2: ("start_s", "end_s")}
 
 @dataclass(frozen=True)
 class Scan:
-    """An edge at each sample: its score `B` [n] and information `A` [n], 0 where none is looked for. `bend` [n]:
-    1 - correlation of the score at each place with the next one's. `turns`: times that the drift forgets. `none`: ln
+    """An edge at each sample: its score `B` [n] and information `A` [n], 0 where no edge is sought. `bend` [n]:
+    1 - correlation of the score at each place with the next place's. `turns`: times that the drift forgets. `none`: ln
     likelihood without a change, the columns' coefficients integrated out, less a constant."""
 
     B: Array
@@ -48,11 +48,11 @@ class Scan:
         return np.where(self.A > 0.0, 0.5 * self.B**2 / np.where(self.A > 0.0, self.A, 1.0), 0.0)
 
     def free(self, edges: int = 1) -> int:
-        """Coefficients that noise alone gains as."""
+        """Number of coefficients whose gain noise alone has."""
         return 2 if edges == 1 and self.turns > FORGETS else 1
 
     def price(self, gain: float, edges: int = 1) -> float:
-        """ln of the number of independent looks: each edge costs as much as one of a step's."""
+        """ln of the number of independent looks: each edge costs as much as a step's."""
         return edges * ln_looks(self.bend, gain) + (LN_SLOW if edges > 1 else 0.0)
 
     def worth(self, gain: float) -> float:
@@ -65,7 +65,7 @@ class Scan:
 
 
 def peaks(gain: Array, count: int, apart: int) -> list[int]:
-    """Places of the largest gains [n] above 0, none within so many samples of a larger one."""
+    """Places of the largest gains [n] above 0, each more than `apart` samples from a larger gain."""
     left, places = gain.copy(), list[int]()
     while len(places) < count and left.max() > 0.0:
         places.append(int(np.argmax(left)))
@@ -74,7 +74,7 @@ def peaks(gain: Array, count: int, apart: int) -> list[int]:
 
 
 def scan(series: Series, fit: Fit, held: Array | None = None) -> Scan:
-    """A step that begins at each sample, the columns of the model fitted beside it; less a step `held` [n]."""
+    """A step that begins at each sample, with the columns of the model refitted; less a step `held` [n]."""
     found = shifts(series if held is None else series.beside(held), fit.terms, fit.theta)
     G, p = found.sums.G, 1 + len(series.columns)
     c, inverse, rss = found.sums.of(range(p)).coefficients()
@@ -131,7 +131,7 @@ def raised(n: int, begin: int, end: int | None = None) -> Array:
 
 
 def edge(state: State, fit: Fit, places: tuple[int, ...], k: int) -> Scan:
-    """The edge `k` of a change at each sample, the other one at its place."""
+    """The edge `k` of a change at each sample, the other edge at its place."""
     if len(places) == 1:
         return scan(state.series, fit)
     n, other = state.y.size, places[1 - k]
@@ -143,7 +143,7 @@ def edge(state: State, fit: Fit, places: tuple[int, ...], k: int) -> Scan:
 def shape(state: State, cause: str, places: tuple[int, ...], steps: Scan) -> Shape:
     """A change of the level at some places, in a gap in its middle. `steps`: the scan that has a search's price."""
     first, last = between_readings(state.y, np.array(places))
-    at = (first + last) // 2  # any place of a gap may be the one
+    at = (first + last) // 2  # the edge may be at any place of a gap
     times = (at * state.dt).tolist()
     stated = known(state, at, last - first + 1)
     values = raised(state.y.size, *at)
@@ -171,8 +171,8 @@ def between_readings(y: Array, places: Rows) -> tuple[Rows, Rows]:
 
 
 def known(state: State, places: Sequence[int] | Rows, samples: Sequence[int] | Rows | Array) -> dict[str, Any]:
-    """When a change is: each edge lies between the last reading before it and the first one after it, so many samples
-    apart. Means begin with their first reading."""
+    """Time of a change: each edge lies between the last reading before it and the first after it, `samples` apart.
+    Means begin with their first reading."""
     width = np.asarray(samples) * state.dt / math.sqrt(12.0)
     found = {"time_s": normal_entry(float(places[0] - 0.5 / state.block) * state.dt, float(width[0]), "s")}
     if len(places) > 1:
@@ -181,13 +181,13 @@ def known(state: State, places: Sequence[int] | Rows, samples: Sequence[int] | R
 
 
 def name(cause: str, times: list[float]) -> str:
-    """Of the column in a model file."""
+    """Name of the column in a model file."""
     return f"{cause}_{'_'.join(f'{time:.6g}' for time in times)}s"
 
 
 def sharper(state: State, fit: Fit, places: tuple[int, ...]) -> tuple[int, ...]:
-    """The best places beside a fit, each in turn at its best sample: the drift that is left beside a change is smaller
-    than the null's, which has swallowed a part of it."""
+    """The best places at a fit, each in turn at its best sample: the drift fitted with a change is smaller than the
+    null's, which has swallowed a part of the change."""
     now = list(places)
     for k in (1, 0, 1, 0) if len(places) > 1 else (0,):
         now[k] = int(np.argmax(edge(state, fit, (*now,), k).gain))
@@ -200,7 +200,7 @@ def posterior(places: tuple[int, ...], state: State) -> dict[str, Any]:
     Two edges hardly know each other: each is taken with the other held. The amplitude's shift by both is summed."""
     column = raised(state.y.size, *places)
     fit = state.with_columns(column)[1]
-    # A gap is one place, the first reading after it, and as likely as it is long.
+    # A gap is a single place, the first reading after it, and as likely as it is long.
     first, last = between_readings(state.y, np.arange(state.y.size))
     wide, there = last - first + 1.0, np.isfinite(state.y)
     places = (*last[[*places]].tolist(),)

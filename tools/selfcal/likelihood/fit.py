@@ -1,4 +1,4 @@
-"""Maximum likelihood of a noise model with regressors, by one Kalman filter over the record and every column."""
+"""Maximum likelihood of a noise model with regressors, by a Kalman filter over the record and every column."""
 
 from __future__ import annotations
 
@@ -19,44 +19,44 @@ from selfcal.base.grid import SLOPE_STEP, Array, Mask
 from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import LN_SIZE, PARAMETERS, Terms, matrices
 
-#: Columns that the compiled filter takes in one pass beside the record.
+#: Most columns of a pass of the compiled filter, without the record.
 COLUMNS_MOST = _likelihood.COLUMNS_MAX - 1
-#: Products of matrices that numpy leaves to one thread.
+#: Largest product of matrices that numpy computes in one thread, multiplications.
 ONE_THREAD = 200_000
-#: A column of which the others leave less than this share is one of theirs: half of a double's digits are left.
+#: Share of a column's sum of squares below which it depends on the other columns: half of a double's digits are left.
 DEPENDENT_SHARE = math.sqrt(np.finfo(float).eps)
-#: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
+#: Change of ln likelihood in a step below which a fit has settled: a hundredth of the smallest evidence reported.
 FTOL = 0.01
-#: ... of a quick look, which ranks causes and measures none: their evidence differs by more.
+#: The same change for a quick look, which only ranks causes: their evidence differs by more.
 ROUGH_FTOL = 0.3
 #: Standard deviations of a model's parameters at which posteriors of coefficients are summed.
 NODE_SDS = (-2.0, -1.0, 0.0, 1.0, 2.0)
-#: A direction whose standard deviation is above this is walked instead, in such steps, while ln likelihood is within so
-#: much of the best; where it changes by less a step, the term that the parameter sizes has vanished.
+#: Standard deviation of a direction above which it is walked instead, the step, and the fall of ln likelihood that ends
+#: the walk. Change of ln likelihood a step below which the parameter's term has vanished. Longest walk.
 HARDLY, NODE_STEP, WALKED_NATS, PLATEAU, NODES_FARTHEST = 0.7, 0.6, 4.0, 0.02, 18.0
-#: Longer records know their parameters well enough: the best ones stand for all.
+#: Most samples of a record whose parameters are varied: longer records know them well enough.
 SUMMED_SAMPLES_MOST = 100_000
-#: Steps of a fit at most, how far one goes at most in any parameter, and how much shorter one is that went too far.
+#: Most steps of a fit, longest step in any parameter, and the factor that shortens a step that went too far.
 STEPS_MOST, STRIDE_MOST, SHORTER = 40, 3.0, 0.25
-#: A step that promises less than this share of `ftol` is not taken.
+#: Least gain that a step must promise, as a share of `ftol`.
 PROMISE_LEAST = 0.2
-#: A size of less information than this may as well be nothing: its standard deviation is a factor of two.
+#: Information of a ln size below which the size may be nothing: its standard deviation is a factor of two.
 WEAK = 2.0
-#: Drifts that are nothing below a size, and where they are then looked for.
+#: Parameters of a drift, the ln size below which the drift is nothing, and the values at which it is then sought.
 LARGER = (
     (("ln_rho",), -7.0, ((-7.0,), (-5.5,))),
     (("ln_markov", "ln_alpha"), -5.0, ((-5.0, -7.0), (-5.0, -5.0), (-5.0, -3.0), (-5.0, -1.7))),
 )
-#: Logarithm of a drift over the white noise at which this is nothing.
+#: ln of a drift over the white noise above which no white noise is left.
 DROWNED = LN_SIZE[1] - 0.01
 
 
 @dataclass(frozen=True)
 class Series:
     """One axis on an even grid: `y` float64[n] (NaN: missing), `dt` s, `r` float64[n] variance of the white noise
-    relative to the nominal one. `columns` [p, n] of known disturbances; the first is the bias, all ones. A fit has
+    over its nominal variance. `columns` [p, n] of known disturbances; the first is the bias, 1 throughout. A fit has
     settled when a step changes ln likelihood by less than `ftol`. `y` are means of `block` readings; `r` is above 1
-    where some are lost."""
+    where readings are lost."""
 
     y: Array
     dt: float
@@ -74,13 +74,13 @@ class Series:
         return self.y.size * self.dt
 
     def beside(self, more: Array) -> Series:
-        """The same with further columns [k, n]."""
+        """The series with further columns [k, n]."""
         return replace(self, columns=np.ascontiguousarray(np.vstack([self.columns, np.atleast_2d(more)])))
 
 
 @dataclass(frozen=True)
 class Sums:
-    """What one pass of the filter leaves: Gram matrix [1 + p, 1 + p] of the whitened record and columns, sum of ln s,
+    """Results of a pass of the filter: Gram matrix [1 + p, 1 + p] of the whitened record and columns, sum of ln s,
     samples used."""
 
     G: Array
@@ -93,8 +93,8 @@ class Sums:
         return replace(self, G=self.G[np.ix_(places, places)], x=self.x[places])
 
     def less(self, known: int) -> Sums:
-        """The record and the columns after the first `known` ones, less what those explain of them. A column that is
-        one of theirs is nothing."""
+        """The record and the columns after the first `known`, less what the first `known` columns explain. A column
+        that depends on the first `known` becomes 0."""
         inverse = replace(self, G=self.G[: 1 + known, : 1 + known]).coefficients()[1]
         rest = [0, *range(1 + known, len(self.G))]
         cross = self.G[1 : 1 + known][:, rest]
@@ -131,7 +131,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted model: `terms` at `theta`, white noise `sigma` of one sample, coefficients `c` of the columns with their
+    """A fitted model: `terms` at `theta`, white noise `sigma` of a sample, coefficients `c` of the columns with their
     standard deviations `sd`, and `ln_likelihood` at its maximum. `information` [k, k], of a fit: that of `theta`."""
 
     terms: Terms
@@ -151,17 +151,17 @@ class Fit:
         return _spread(self.information)
 
     def value(self, name: str) -> float:
-        """One parameter of the vector."""
+        """A parameter of the vector."""
         return float(self.theta[self.terms.names.index(name)])
 
     def shrunk(self, by: float) -> Fit:
-        """The same model with a drift smaller by exp(-by), within its limits. Only its parameters are of that drift."""
+        """The fit with a drift smaller by exp(-by), within its limits. Only its parameters are of that drift."""
         low = np.array(self.terms.limits(self.dt)).reshape(-1, 2)[:, 0]
         return replace(self, theta=np.maximum(self.theta - by * self.terms.sizes, low))
 
     def of_means(self, block: int, less: float) -> Array:
-        """Its parameters for means of so many samples, sizes of the drift times e to `less`: they are relative to the
-        white noise."""
+        """Parameters for means of `block` samples, relative to their white noise. Sizes of the drift are multiplied by
+        e^`less`."""
         terms = self.terms
         theta = self.theta + math.log(block) * terms.growth + less * terms.sizes
         return np.asarray(np.where(terms.growth > 0.0, np.maximum(theta, LN_SIZE[0]), theta))
@@ -183,7 +183,7 @@ class Fit:
 
     @property
     def increment(self) -> float:
-        """Of the counter whose remainders are the quantization noise: sqrt(12) Q, unit times s."""
+        """Increment of the counter whose remainders are the quantization noise: sqrt(12) Q, unit times s."""
         m = math.tanh(self.value("color"))
         return self.sigma * self.dt * math.sqrt(-12.0 * m / (1.0 + m * m))
 
@@ -196,7 +196,7 @@ class Fit:
 
     @property
     def K(self) -> float:
-        """Coefficient of the random walk, unit/s/sqrt(Hz); 0 without one."""
+        """Coefficient of the random walk, unit/s/sqrt(Hz); 0 without a walk."""
         return self.sigma * math.exp(self.value("ln_rho")) / math.sqrt(self.dt) if self.terms.walk else 0.0
 
     @property
@@ -213,7 +213,7 @@ class Fit:
 def run(
     series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
 ) -> tuple[list[Sums], Array, Array]:
-    """One pass, counted as work; sums up to each of `marks` (default: the end), whitened innovations [n, 1 + p], their
+    """A pass, counted as work: sums up to each of `marks` (default: the end), whitened innovations [n, 1 + p], their
     variances [n]."""
     G, D, n, x, white, s = passed(series, terms, theta, marks, innovations)
     return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(G))], white, s
@@ -222,8 +222,8 @@ def run(
 def passed(
     series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances. The filter
-    whitens each column by itself: where they are too many for one pass, G is of the whitened ones."""
+    """A pass as `run`, its sums as arrays: G, D, n and x of each mark, innovations, and their variances. The filter
+    whitens each column by itself: where they are too many for one pass, G is of the whitened columns."""
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
     at = list(marks) or [series.y.size]
     parts = _parts(series.columns)
@@ -246,8 +246,8 @@ def passed(
 
 
 def left(series: Series, fit: Fit, more: Array) -> Array:
-    """The record and further columns [n, 1 + k] behind the filter of a fit, less what the series' own columns explain:
-    nothing of one that is theirs, and 0 where the record is missing."""
+    """The record and further columns [n, 1 + k] behind the filter of a fit, less what the series' own columns explain.
+    A column that depends on the series' columns is 0, and so are missing samples."""
     white = np.nan_to_num(run(series.beside(more), fit.terms, fit.theta, innovations=True)[1])
     k = 1 + len(series.columns)
     q, rest = np.linalg.qr(white[:, 1:k])[0], np.delete(white, range(1, k), axis=1)
@@ -282,7 +282,7 @@ class Shifts:
 
 
 def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
-    """One pass of the filter, and one backwards over its gains: exact beside gaps, and where the noise changes."""
+    """`Shifts` by a pass of the filter and a pass back over its gains: exact at gaps, and where the noise changes."""
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
 
     parts = _parts(series.columns)
@@ -312,9 +312,8 @@ def ln_likelihood(sums: Sums) -> float:
 def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
     """Slope [k] of ln likelihood by the parameters of a fit, and their information [k, k].
 
-    One pass over the record less its columns: their coefficients are the best ones, and a small change of theta moves
-    the likelihood by none of theirs. sigma is free in the information. More parameters than a pass takes have one for
-    every two pairs of them."""
+    A pass filters the record less its columns at their best coefficients, by which ln likelihood has no slope. sigma is
+    free in the information. If a pass cannot take all parameters, every two pairs of parameters have a pass."""
     work.count(series.y.size, at.theta.size)
     terms, theta = at.terms, at.theta
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
@@ -340,15 +339,15 @@ def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
 
 
 def refit(series: Series, known: Fit) -> Fit:
-    """The same model on much the same record, from where it was."""
+    """The model refitted to a similar record, from its own parameters."""
     return _climbed(series, fit_at(series, known.terms, known.theta))
 
 
 def fit(series: Series, terms: Terms, start: Array | None = None) -> Fit:
     """Best `theta` from `start`, or from the best of a few starts.
 
-    Where a drift has gone to nothing, a larger one is looked for once more: a likelihood may have a second top there,
-    and a Gauss-Markov drift may have gone there with the wrong rate."""
+    A drift that has gone to nothing is tried once more at larger sizes. The likelihood may have a second top there, or
+    a Gauss-Markov drift may have gone to nothing with the wrong rate."""
     low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
     starts = [start] if start is not None else _starts(terms, np.array([low, high]).T)
     found = _climbed(series, best([fit_at(series, terms, np.clip(start, low, high)) for start in starts]))
@@ -410,7 +409,7 @@ def _climbed(series: Series, here: Fit) -> Fit:
                 break
             reach *= SHORTER
         here = replace(there, information=here.information)
-        # A small gain that came as promised, by a step that nothing has shortened, was the last one.
+        # Stop after a small gain that came as promised, by a step that was not shortened.
         whole = float(np.abs(move).max()) < 0.4 * reach and not (weak & (slope < 0.0)).any()
         if whole and gain < 3.0 * series.ftol and abs(more - gain) < 0.2 * gain:
             break
@@ -421,8 +420,8 @@ def _climbed(series: Series, here: Fit) -> Fit:
 def _move(size: Mask, slope: Array, information: Array, low: Array, high: Array, reach: float) -> tuple[Array, float]:
     """A step [k] of theta between `low` and `high`, no parameter by more than `reach`, and the gain that it promises.
 
-    A size that falls takes its step as a variance: ln likelihood is nearly a parabola of that down to nothing. One that
-    grows takes a step of more than 1 so: from nothing its logarithm has to go far."""
+    A size that falls steps as a variance: ln likelihood is nearly a parabola of the variance down to 0. A size that
+    grows does so beyond a step of 1: from nothing its logarithm has to go far."""
     down, up = np.where(size, 0.5 * reach, reach), np.where(size, 4.0 * reach, reach)
     bounds = np.array([np.maximum(low, -down), np.minimum(high, up)])
     bend = size & (np.array([[True], [False]]) | (bounds > 1.0))
@@ -465,10 +464,10 @@ def _spread(information: Array) -> Array:
 
 
 def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
-    """Parameters of the drift about a fit's, within their limits, and ln of the share of those that each stands for.
+    """Nodes of the drift's parameters about a fit, within their limits, and ln of the prior share of each node.
 
     Within a drift, the prior of its size is Jeffreys' for a weak walk: the information of ln rho is n rho / 2. A flat
-    one counts sizes that no record tells from nothing, and intervals beside a weak walk are too short."""
+    prior counts sizes that no record distinguishes from nothing: intervals with a weak walk are then too short."""
     if not found.terms.names or series.n > SUMMED_SAMPLES_MOST or series.ftol > FTOL:
         return [(found.theta, 0.0)]
     spread = found.spread
@@ -494,7 +493,7 @@ def _possible(series: Series, found: Fit, direction: Array, limits: Array) -> Ar
     """Moves of theta along a `direction` that the record leaves possible, evenly spaced.
 
     A parameter that the record hardly knows has no normal posterior: on one side its term vanishes, and nothing changes
-    any more. Of that plateau one node is kept: a term so small acts on no coefficient."""
+    any more. A single node of that plateau is kept: a term of that size acts on no coefficient."""
 
     def value(move: float) -> float:
         theta = found.theta + move * direction
@@ -523,7 +522,7 @@ def fit_at(series: Series, terms: Terms, theta: Array) -> Fit:
 
 
 def _starts(terms: Terms, limits: Array) -> list[Array]:
-    """All combinations of a few guesses a parameter; further ones at the middle of their limits."""
+    """All combinations of a few guesses a parameter; a parameter without guesses is at the middle of its limits."""
     grids = [
         PARAMETERS[name].starts or (0.5 * (low + high),) for name, (low, high) in zip(terms.names, limits, strict=True)
     ]
@@ -539,6 +538,6 @@ def best(fits: Sequence[Fit]) -> Fit:
 
 
 def moved(fit_: Fit, terms: Terms, own: Mapping[str, float] = MappingProxyType({})) -> Array:
-    """A start for `terms` from another model's fit: shared parameters are kept, new ones begin small, or as `own`."""
+    """A start for `terms` from another model's fit: shared parameters are kept, the new begin small, or as `own`."""
     known = {**dict(zip(fit_.terms.names, fit_.theta, strict=True)), **own}
     return np.array([known.get(name, PARAMETERS[name].fresh) for name in terms.names])

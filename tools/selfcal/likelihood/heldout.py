@@ -23,7 +23,7 @@ HARM_SD = 2.0
 
 @dataclass(frozen=True)
 class HeldOut:
-    """The contract's `gain` of one finding, or None with the `reason`."""
+    """The contract's `gain` of a finding, or None with the `reason`."""
 
     gain: dict[str, Any] | None
     reason: str | None = None
@@ -57,7 +57,7 @@ def error_entry(before: Array, after: Array) -> dict[str, float] | None:
 
 
 def harmful(parts: Sequence[HeldOut]) -> bool:
-    """Whether what was found on some axes predicts the rest of the record clearly worse, all axes together."""
+    """Whether the findings on some axes predict the rest of the record clearly worse, all axes together."""
     gains = [part.gain for part in parts if part.gain is not None]
     return bool(gains) and in_sd(gains) < -HARM_SD
 

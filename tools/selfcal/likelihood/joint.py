@@ -1,8 +1,8 @@
-"""One model of all axes: y_i(t) = c_i + l_i f(t) + d_i(t) + e_i(t).
+"""Model of all axes together: y_i(t) = c_i + l_i f(t) + d_i(t) + e_i(t).
 
-f is one quantity that nobody recorded: a Gauss-Markov process of variance 1. d_i is the drift of axis i, a random walk
+f is a quantity that nobody recorded: a Gauss-Markov process of variance 1. d_i is the drift of axis i, a random walk
 and a Gauss-Markov process. e is white, with a correlation between the axes. Everything is relative to the white noise
-of one sample of its axis.
+of a sample of its axis.
 
 The parameters are fitted by Whittle's likelihood of the first differences, which have a spectrum although a walk has
 none. Neighbouring frequencies are taken together where the spectra are flat. The likelihood of the record itself, the
@@ -28,19 +28,19 @@ from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS
 from selfcal.logs.recording import bridged
 
-#: Axes that a common quantity takes at least: two that go together are noise that they share.
+#: Least axes with a common quantity: two axes that go together share noise.
 LEAST_AXES = 3
 #: Sine tapers (Riedel & Sidorenko, IEEE Trans. Signal Process. 43, 1995): together they weigh the whole record alike.
 TAPERS = 8
-#: Frequencies that stand for themselves, and groups an octave above them.
+#: Frequencies that are not grouped, and groups an octave above them.
 SINGLE, AN_OCTAVE = 64, 24
-#: A bin so far above the level of its neighbours, in units of their mean, holds a line, and so many bins beside it.
+#: Power of a bin with a line, over the mean of its neighbours; bins on each side that the line spoils; neighbours.
 LINE, LINE_BESIDE, NEIGHBOURS = 14.0, 2, 200
-#: The same of a line that its axis shows by itself beyond doubt.
+#: Power of a line that its axis shows by itself beyond doubt, over the mean of its neighbours.
 CLEAR_LINE = 40.0
 #: Correlation times of f that a fit begins at, s.
 STARTS_S = (30.0, 300.0)
-#: The shortest one, s: faster is noise that the axes share.
+#: Shortest correlation time of f, s: a faster process is noise that the axes share.
 FASTEST_S = 10.0
 #: Prior standard deviations of ln sizes and ln rates about the middle of their limits: they keep what the record does
 #: not know from running away, and change ln likelihood by a few tenths elsewhere.
@@ -49,8 +49,8 @@ PRIOR_SD = 3.0
 OF_DRIFT, OF_LOADING = 0.5, 0.1
 #: Widths of the size of a column, in its own standard deviations.
 SIZE_WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
-#: ln of the odds that an axis has a column which another one has, before its own readings: of axes without it, 1 in 100
-#: are then taken for one with it, 1 in 20 at even odds.
+#: ln of the odds that an axis has another axis' column, before its own readings: 1 in 100 axes without the column are
+#: then taken to have it, 1 in 20 at even odds.
 LN_ODDS = math.log(0.25)
 #: Numbers of an axis' own drift: ln of white noise, walk a step, Gauss-Markov deviation, rate a sample.
 OWN = 4
@@ -71,7 +71,8 @@ class Bins:
         return 2.0 - 2.0 * np.cos(self.turn)
 
     def markov(self, rate: Array) -> tuple[Array, Array]:
-        """The same [k, rates] of Gauss-Markov processes of rates a sample, and its slopes over ln of the rates."""
+        """Spectra [k, rates] of differences of Gauss-Markov processes of variance 1, and slopes over ln of the rates a
+        sample."""
         a, cosine = np.exp(-rate), 1.0 - 0.5 * self.white[:, None]
         power, below = -np.expm1(-2.0 * rate), 1.0 - 2.0 * a * cosine + a * a
         value = power / below * self.white[:, None]
@@ -79,7 +80,7 @@ class Bins:
 
 
 def _lines(power: Array, least: float = LINE) -> Mask:
-    """Bins [n] of a spectrum that hold a line, or lie beside one."""
+    """Bins [n] of a spectrum that hold a line, or lie next to a line."""
     half = min(NEIGHBOURS, max(8, power.size // 8)) // 2
     level = median_filter(power, 2 * half + 1, mode="reflect") / math.log(2.0)
     found = np.zeros(power.size, bool)
@@ -98,8 +99,8 @@ def without_lines(y: Array, least: float = CLEAR_LINE) -> tuple[Array, Mask]:
     """Records [m, n] (NaN: missing) less their lines of `least` times the level, and where [n // 2 + 1] of the spectrum
     that was done.
 
-    A line is taken to 0 Hz and its slow amplitude out. The amplitude goes on as its mirror at the ends, so that one
-    whose frequency wanders does not ring there."""
+    A line is shifted to 0 Hz and its slow amplitude subtracted. The amplitude is mirrored at the ends, so that a line
+    with a wandering frequency does not ring there."""
     n, present, y = y.shape[1], np.isfinite(y), bridged_rows(y)
     where = np.any([_lines(np.abs(row) ** 2, least) for row in np.fft.rfft(np.diff(y, axis=1), axis=1)], axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
@@ -114,7 +115,7 @@ def without_lines(y: Array, least: float = CLEAR_LINE) -> tuple[Array, Mask]:
 
 
 def bins_of(y: Array) -> Bins:
-    """Of records y [m, n] in units of their white noise, gaps bridged. Bins with a line on any axis are left out."""
+    """Bins of records y [m, n] in units of their white noise, gaps bridged. Bins with a line on an axis are dropped."""
     difference = np.diff(bridged_rows(y), axis=1)
     n = difference.shape[1]
     where = math.pi * (np.arange(n) + 0.5) / n
@@ -189,7 +190,7 @@ def _lower(m: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
 
 class _Cost:
     """-ln likelihood and its slope over a vector of parameters: own drifts, the rows of a root of the correlation, and
-    the loadings and ln rate of f if it has one."""
+    the loadings and ln rate of f if the model has f."""
 
     def __init__(self, bins: Bins, f: bool) -> None:
         self.bins, self.f, self.m = bins, f, bins.power.shape[1]
@@ -274,8 +275,8 @@ class _Cost:
 
 
 def fit_joint(bins: Bins, dt: float, f: bool, start: Joint | None = None, *, held: bool = False) -> Joint:
-    """The model of most likelihood, with f or without. `start`: one near it, to which f is added if it has none. It
-    keeps f as that has it where f is `held`."""
+    """The model of most likelihood, with f or without. `start`: a model near it, to which f is added if absent. If f is
+    `held`, it stays as in `start`."""
     cost, m = _Cost(bins, f), bins.power.shape[1]
     size, rate = np.log(SIZE_LIMITS), np.log(np.array(ALPHA_LIMITS) * dt)
     rate[1] = min(rate[1], math.log(2.0))
@@ -318,20 +319,20 @@ def _least(cost: _Cost, start: Array, bounds: Array) -> tuple[float, Array]:
 
 
 def refitted(model: Joint, y: Array, dt: float) -> Joint:
-    """The model of records [m, n] near another one, with f if that has it."""
+    """The model fitted to records [m, n] from a model near it, with f if that model has it."""
     return fit_joint(bins_of(y), dt, model.has_f, model)
 
 
 def without_each(bins: Bins, model: Joint) -> Array:
-    """What ln likelihood loses [m] where f does not move an axis."""
+    """Loss of ln likelihood [m] if f does not move an axis."""
     every = range(model.loading.size)
     none = [replace(model, loading=np.where(np.arange(len(every)) == k, 0.0, model.loading)) for k in every]
     return _value(bins, model) - np.array([_value(bins, model_without) for model_without in none])
 
 
 def without_pairs(bins: Bins, model: Joint, source: int, others: Sequence[int]) -> float:
-    """The same where the white noise of an axis does not go together with some others'; infinite where the rest need it
-    to."""
+    """Loss of ln likelihood if the white noise of an axis is not correlated with the `others`; infinite if the
+    remaining correlations need it."""
     correlation = model.correlation.copy()
     correlation[source, others] = correlation[others, source] = 0.0
     if float(np.linalg.eigvalsh(correlation)[0]) < 1e-6:
@@ -361,7 +362,7 @@ def _together(bins: Bins, own: Array) -> Array:
 @dataclass(frozen=True)
 class Course:
     """What filter and smoother make of a record. `ln_likelihood`; `innovations` [n, m] of each axis (NaN: missing) and
-    their variances `spread` [n, m], of missing ones too; `predicted` [n, s]: the states before each sample. Of the
+    their variances `spread` [n, m], also of missing readings; `predicted` [n, s]: the states before each sample. Of the
     smoother: `f` [n]; `weights` [n, m]: the record times its inverse covariance, so that the score of any column is its
     product with them; `of_f` [n, 2]: score of a jump of f just before each sample, and its information; `shock` [n, m]
     and `known` [n, m, m]: the same of the levels."""
@@ -387,14 +388,14 @@ class Course:
 
 
 def last(model: Joint, y: Array) -> tuple[Array, Array]:
-    """What each axis of records y [m, n] is without its white noise, a sample after the last: mean and standard
+    """Prediction of each axis of records y [m, n] without its white noise, a sample after the last: mean and standard
     deviation [m]."""
     found = course(model, np.column_stack([y, np.full(len(y), np.nan)]))
     return ahead(model, found, 1)[-1], np.sqrt(found.spread[-1] - model.white**2)
 
 
 def ahead(model: Joint, found: Course, steps: int) -> Array:
-    """Prediction [n, m] of each axis `steps` samples after the last one that it knows, which is the one before."""
+    """Prediction [n, m] of each axis `steps` samples after its last known sample, which is just before each place."""
     m = model.loading.size
     x = found.predicted * _matrices(model)[0] ** (steps - 1)
     predicted: Array = x[:, :1] * model.loading + x[:, 1 : 1 + m] + x[:, 1 + m :]
@@ -423,16 +424,16 @@ def course(model: Joint, y: Array, smooth: bool = False) -> Course:
 
 
 def information(model: Joint, y: Array, columns: Array) -> Array:
-    """Information [k, m, m] of each column [k, n] on every axis of records y [m, n], beside the levels."""
+    """Information [k, m, m] of each column [k, n] on every axis of records y [m, n], the levels unknown."""
     work.count(y.shape[1], len(columns) * len(y))
     return _joint.information(np.ascontiguousarray(y), np.ascontiguousarray(columns), *_matrices(model))
 
 
 @dataclass(frozen=True)
 class Act:
-    """What a column of unknown size on unknown axes is worth: `evidence`, nats over none, its search not paid;
-    `probability` [m] that each axis has it; sizes [p, m] of its p parts with their standard deviations [m], nothing and
-    infinite where that is below a half. `sd` is that of the first part."""
+    """Worth of a column of unknown size on unknown axes: `evidence`, nats over no column, its search not paid;
+    `probability` [m] that each axis has it; sizes [p, m] of its p parts, 0 where the probability is below a half; `sd`
+    [m], the standard deviation of the first part, infinite there."""
 
     evidence: float
     probability: Array
@@ -445,9 +446,9 @@ class Act:
 
 
 def act(score: Array, known: Array) -> Act:
-    """Of scores [p, m] of the p parts of a column, each with its information `known` [p, m, m], or all with one [m, m].
+    """`Act` of a column by the scores [p, m] of its p parts. `known`: information [p, m, m] of each, or [m, m] of all.
 
-    Sizes are normal about 0 with one width for all axes of a set, in standard deviations of each axis' own."""
+    Sizes are normal about 0 with the same width for all axes of a set, in standard deviations of each axis' own."""
     p, m = score.shape
     known = np.broadcast_to(known, (p, m, m))
     own = np.diagonal(known, axis1=1, axis2=2)
@@ -474,8 +475,8 @@ def act(score: Array, known: Array) -> Act:
 
 
 def act_apart(ln_bf: Array, size: Array, sd: Array) -> Act:
-    """Of a column on axes whose drifts have nothing in common, by the ln Bayes factors [m, widths] of each alone, its
-    size and that one's standard deviation [m]."""
+    """`Act` of a column on axes whose drifts have nothing in common. `ln_bf` [m, widths]: ln Bayes factors of each axis
+    alone; its `size` [m], with standard deviation `sd` [m]."""
     total, probability = _over_sets(size.size, lambda sets: ln_bf[sets].sum(axis=1).T)
     held = probability >= 0.5
     return Act(total, probability, np.where(held, size, 0.0)[None], np.where(held, sd, math.inf))
@@ -485,8 +486,8 @@ def _over_sets(m: int, ln_bf: Callable[[NDArray[np.intp]], Array]) -> tuple[floa
     """Evidence of a column on some of m axes, and the probability [m] of each, by ln Bayes factors [widths, s] of sets
     of axes [s, count].
 
-    The evidence is a sum over the sets of axes, of which every number of axes is as likely before the record. The
-    probability of an axis is what its own readings say, whatever the others do."""
+    The evidence is a sum over the sets of axes. Every number of axes is as likely before the record. The probability of
+    an axis is what its own readings say, whatever the others do."""
     sets, ln_prior, member = _sets(m)
     worth = np.logaddexp.reduce(np.hstack([ln_bf(each) for each in sets]), axis=0) - math.log(len(SIZE_WIDTHS))
     total = float(np.logaddexp.reduce(worth + ln_prior))

@@ -1,4 +1,4 @@
-"""What is known of one axis at a point of the loop: its record, the model so far, and what a candidate would gain."""
+"""State of an axis at a point of the loop: its record, the model so far, and the gain of a candidate."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from selfcal.readings.lattice import OFF
 if TYPE_CHECKING:
     from selfcal.likelihood.columns import Shape
 
-#: Evidence of a look at one axis that is named, net of its search, nats.
+#: Least evidence of a look at one axis that is named, net of its search, nats.
 NET_LEAST = -math.log(P_LOOK)
-#: Evidence of all axes together that is named, nats. It is a Bayes factor: chance makes one of e^T in a share of e^-T
-#: at most (Markov's inequality).
+#: Least evidence of all axes together that is named, nats: ln of a Bayes factor. Chance reaches T nats with probability
+#: e^-T at most (Markov's inequality).
 EVIDENT = -math.log(OF_MODULES["together"])
-#: A drift whose fit is so far below the best one, nats, is not tried with a candidate; with a finding it is again.
+#: ln likelihood below the best fit, nats, at which a drift is not tried with a candidate; with a finding it is again.
 HOPELESS_NATS = 40.0
-#: Two causes whose worth differs by less than this, nats, cannot be told apart.
+#: Difference of worth, nats, below which two causes cannot be distinguished.
 ALIKE = 3.0
-#: Score gains below this are not worth a refit: the refit gains about as much.
+#: Least score gain worth a refit, nats: below, the refit gains about as much.
 SCREEN = 2.0
-#: Columns that one pass of the filter takes beside the model's.
+#: Most columns of a pass of the filter, without the model's.
 ABREAST = 8
-#: Means of a record that are enough for a first search; the longest in which a slow column is whole, s.
+#: Means of a record that are enough for a first search; the longest mean in which a slow column is whole, s.
 MEANS_MOST, SLOW_S = 3000, 1.0
 
 
-#: No term beside white noise and the drift.
+#: No term other than white noise and the drift.
 NONE = Terms()
 #: ln evidence [marks] of the samples before each mark; by horizon the bias that is predicted from each of its places.
 Sequential = tuple[Array, Mapping[float, Array]]
@@ -47,8 +47,8 @@ Sequential = tuple[Array, Mapping[float, Array]]
 
 @dataclass(frozen=True)
 class FittedColumn:
-    """A column that is in an axis' model. `entry` is the model file's (without prior), empty where it
-    cannot state the column; `unit` the column's."""
+    """A column that is in an axis' model. `entry` is the model file's (without prior), empty if the file cannot state
+    the column; `unit` the column's."""
 
     name: str
     cause: str
@@ -59,13 +59,13 @@ class FittedColumn:
 
 @dataclass(frozen=True)
 class State:
-    """One axis: the record `y` on its grid (NaN: missing or kept out), the regressors and extras of its model so far.
+    """An axis: the record `y` on its grid (NaN: missing or kept out), the regressors and extras of its model so far.
 
-    `fits` are those of every base drift; `whitened` float64[n] the residual innovations of the best, `variance` [n]
-    theirs. `redrawn`: not all values are as read: clipped ones were drawn anew, or
-    they are block means. `below_lattice`: the noise of a reading is so far below the lattice that rounding is no
-    noise, and no linear model judges the axis. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
-    the model file's. `ftol`: of its fits, `block`: readings of a mean, see Series.
+    `fits`: the fit of every base drift; `whitened` float64[n]: residual innovations of the best fit, `variance` [n]
+    theirs. `redrawn`: not all values are as read: clipped values were drawn anew, or they are block means.
+    `below_lattice`: the noise of a reading is so far below the lattice that rounding is no noise, and no linear model
+    judges the axis. `lsb`: the lattice the values lie on (0: no lattice), `stated_lsb` the model file's. `ftol`: of its
+    fits, `block`: readings of a mean, see Series.
     """
 
     axis: str
@@ -92,7 +92,7 @@ class State:
         return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns), self.ftol, self.block)
 
     def means(self, longest_s: float = math.inf) -> tuple[Series, int]:
-        """Means of blocks of `longest_s` at most, NaN where half of one is missing, and the samples of a block."""
+        """Means of blocks of `longest_s` at most, NaN where half of a block is missing, and the samples of a block."""
         n = self.y.size
         block = max(1, int(min(n // MEANS_MOST, longest_s / self.dt)))
         mean, used = half_means(self.y, block)
@@ -127,7 +127,7 @@ class State:
         return (replace(self.extras, walk=True), replace(self.extras, markov=True))
 
     def near(self) -> tuple[Terms, ...]:
-        """Those that a candidate may make the best."""
+        """The drifts that a candidate may make the best."""
         least = self.best.ln_likelihood - HOPELESS_NATS
         far = {drift.terms for drift in self.fits if drift.ln_likelihood < least}
         return tuple(terms for terms in self.bases() if terms not in far)
@@ -148,7 +148,7 @@ class State:
         return replace(state, whitened=residual, variance=s * chosen.sigma**2)
 
     def without(self, names: Collection[str]) -> State:
-        """The state less some columns. Its fits are still those with them, from which a fit beside it starts."""
+        """The state without some columns. Its fits still have the columns: the next fit starts there."""
         return replace(
             self, regressors=tuple(regressor for regressor in self.regressors if regressor.name not in names)
         )
@@ -159,7 +159,7 @@ class State:
         return replace(self, y=self.y[:samples], r=self.r[:samples], regressors=cut, fits=()).refit()
 
     def stiffer(self, by: float) -> list[Fit]:
-        """The best fit with a drift smaller by exp(-by), if it has one."""
+        """The best fit with a drift smaller by exp(-by), if it has a drift."""
         return [self.best.shrunk(by)] if self.best.terms.sizes.any() else []
 
     def with_columns(self, more: Array) -> tuple[float, Fit]:
@@ -177,12 +177,12 @@ class State:
         return best(fits).ln_likelihood - self.best.ln_likelihood, tuple(fits)
 
     def fitted_with(self, terms: Terms, more: Array) -> Fit:
-        """The fit of one drift with further columns [k, n]."""
+        """The fit of a drift with further columns [k, n]."""
         return _fit_from(self.series.beside(more), terms, self.fits)
 
     @cached_property
     def sequential(self) -> dict[bytes, Sequential]:
-        """Its scores on held-out time that are known, by their marks."""
+        """Known scores on held-out time, by their marks."""
         return {}
 
     @property
@@ -191,8 +191,8 @@ class State:
         return np.empty((0, self.y.size))
 
     def possible(self, more: Array, *, rich: bool) -> Iterator[tuple[Fit, Array, float]]:
-        """The fit of every near drift with further columns [k, n], `rich`: of one of two terms as well. Of each the
-        parameters that the record leaves possible, and ln of the share of those that they stand for."""
+        """The fit of every near drift with further columns [k, n]; if `rich`, of a drift of two terms as well. With
+        each fit the parameters that the record leaves possible, and ln of their prior share."""
         series = self.series.beside(more)
         fits = [self.fitted_with(terms, more) for terms in self.near()]
         if rich and not self.extras.all_scales:
@@ -202,9 +202,9 @@ class State:
                 yield drift, theta, ln_share
 
     def posterior(self, *alternatives: Array) -> tuple[Array, Array, Array]:
-        """Coefficients of further columns [k, n] over every near drift, one of two terms, and their parameters: weights
-        [a, m], means [a, m, k] and standard deviations [a, m, k] of the normals that they are the sum of. Each of the
-        `alternatives`, the likeliest first, is one set of columns; before the record they are equally likely."""
+        """Coefficients of further columns [k, n] over every near drift, a drift of two terms, and their parameters, as
+        a sum of normals: weights [a, m], means [a, m, k] and standard deviations [a, m, k]. Each of the `alternatives`,
+        the likeliest first, is a set of columns; before the record they are equally likely."""
         blocks = [np.atleast_2d(block) for block in alternatives]
         found: list[tuple[Array, Array, Array]] = []
         for drift, theta, ln_share in self.possible(blocks[0], rich=True):
@@ -222,14 +222,14 @@ class State:
 
     @cached_property
     def slow(self) -> tuple[State, int]:
-        """The axis in means of up to `SLOW_S`, in which all of a slow column is, and the samples of a mean."""
+        """The axis in means of up to `SLOW_S`, which keep a slow column whole, and the samples of a mean."""
         series, block = self.means(SLOW_S)
         if block == 1:
             return self, 1
         columns = [
             replace(regressor, values=mean) for regressor, mean in zip(self.regressors, series.columns[1:], strict=True)
         ]
-        bands = [  # sizes are relative to the white noise; faster ones average out
+        bands = [  # sizes are relative to the white noise; faster bands average out
             (period, damping, ln_size + PARAMETERS["ln_swing"].grows * math.log(block))
             for period, damping, ln_size in self.extras.bands
             if period >= PERIOD_LIMITS[0]
@@ -239,7 +239,7 @@ class State:
 
     @cached_property
     def ln_marginal(self) -> float:
-        """ln likelihood of the record over every near drift, one of two terms, and their parameters."""
+        """ln likelihood of the record over every near drift, a drift of two terms, and their parameters."""
         each = [
             ln_share + _ln_marginal(next(self.sums(drift.terms, theta, [self.none])))
             for drift, theta, ln_share in self.possible(self.none, rich=True)
@@ -247,8 +247,8 @@ class State:
         return float(logsumexp(each))
 
     def averaged(self, more: Array) -> tuple[Array, Array, Array]:
-        """Gains [a] of ln likelihood by further columns [k, n] at every near drift, one of two terms, and their
-        parameters; ln of the share of the record's likelihood without them that each stands for; and the last column's
+        """Gains [a] of ln likelihood by further columns [k, n] at every near drift, a drift of two terms, and their
+        parameters; ln of the share that each has in the record's likelihood without the columns; and the last column's
         coefficients and variances there [a, 2]."""
         gains, shares, sizes = [], [], []
         for drift, theta, ln_share in self.possible(more, rich=True):
@@ -260,14 +260,14 @@ class State:
         return np.array(gains), np.array(shares) - self.ln_marginal, np.array(sizes)
 
     def average_gain(self, more: Array) -> float:
-        """Gain by further slow columns [k, n] averaged over the drifts that the record leaves possible: one that is
-        known from few of its own turns makes nats of any slow column."""
+        """Gain by further slow columns [k, n] averaged over the drifts that the record leaves possible: a drift known
+        from few of its own turns makes nats of any slow column."""
         gains, ln_share, _ = self.averaged(more)
         return float(logsumexp(gains + ln_share))
 
     def bayes(self, column: Array, widths: Array) -> tuple[Array, float, float]:
         """ln Bayes factors [w] of a column [n], its size normal about 0 with a width [w] in its standard deviations;
-        and its size beside all drifts with its deviation."""
+        and its size over all drifts with its deviation."""
         gains, ln_share, sizes = self.averaged(column[None])
         each = (ln_share + gains)[:, None] - gains[:, None] / (1.0 + widths**2) - 0.5 * np.log1p(widths**2)
         weight, (mean, variance) = softmax(each.max(axis=1)), sizes.T
@@ -275,13 +275,13 @@ class State:
         return np.asarray(logsumexp(each, axis=0)), size, math.sqrt(float(weight @ (variance + (mean - size) ** 2)))
 
     def sums(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:
-        """Of the model with each of the blocks [k, n] of further columns: one pass for many of them."""
+        """Sums of the model with each of the blocks [k, n] of further columns. A pass takes many blocks."""
         known = range(2 + len(self.regressors))
         for sums, places in self._passes(terms, theta, blocks):
             yield from (sums.of([*known, *place]) for place in places)
 
     def beside(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:
-        """Of each of the blocks alone, less what the model's columns explain of it and of the record."""
+        """Sums of each of the blocks alone, less what the model's columns explain of it and of the record."""
         known = 1 + len(self.regressors)
         for sums, places in self._passes(terms, theta, blocks):
             less = sums.less(known)
@@ -308,7 +308,7 @@ class State:
 
     def scores(self, blocks: Sequence[Array], at: Fit | None = None) -> Array:
         """Gain [b] of each block [k, n] of further columns with the drift of a fit, by default of the best: a bound
-        from below for what they gain with it refitted. One pass for many of them."""
+        from below for their gain with the drift refitted. A pass takes many blocks."""
         at = self.best if at is None else at
         each = self.beside(at.terms, at.theta, [np.atleast_2d(block) for block in blocks])
         found = [ln_likelihood(sums) for sums in each]
@@ -369,10 +369,10 @@ def ln_looks(bend: Array, gain: float) -> float:
 
 @dataclass(frozen=True)
 class Look:
-    """One candidate.
+    """A candidate.
 
     gain      nats of ln likelihood; `net`: less the price of its search.
-    estimate  intervals with their units; `measure` makes them beside a model that lacks the look's columns alone.
+    estimate  intervals with their units; `measure` makes them by a model that lacks the look's columns alone.
     changes   the fields of the state that has it.
     when      begin and end, s.
     others    what else it might be.
@@ -396,7 +396,7 @@ class Look:
         return channels[0] == channels[1]
 
     def measured(self, beside: State) -> Look:
-        """The look with the sizes that `measure` has beside a model."""
+        """The look with the sizes that `measure` finds by a model."""
         if self.measure is None:
             return self
         return replace(self, estimate={**self.estimate, **self.measure(beside)})
@@ -421,8 +421,8 @@ def of_parameter(fit: Fit, name: str, unit_size: float, unit: str) -> dict[str, 
 
 
 def log_normal(ln_median: float, sd: float, unit: str) -> dict[str, Any]:
-    """A posterior whose logarithm is normal with this standard deviation. Mean and width of one that is hardly known
-    are those of a deviation of 1."""
+    """A posterior whose logarithm is normal with this standard deviation. Mean and width count a deviation above 1 as
+    1."""
     square = min(sd, 1.0) ** 2
     mean = math.exp(ln_median + 0.5 * square)
     q05, median, q95 = (math.exp(ln_median + k * HALF_90 * sd) for k in (-1.0, 0.0, 1.0))

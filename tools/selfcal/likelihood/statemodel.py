@@ -1,6 +1,6 @@
 """Noise models as small state models: which terms a model has, and the matrices that its parameters make.
 
-Everything is relative to the white noise of one sample (standard deviation 1), at the recording's own rate. Parameters
+Everything is relative to the white noise of a sample (standard deviation 1), at the recording's own rate. Parameters
 are a vector of unbounded numbers: logarithms of sizes and rates, atanh of correlations.
 """
 
@@ -18,11 +18,11 @@ from selfcal.base.grid import Array, Mask
 from selfcal.model.file import ABOUT_N
 from selfcal.model.laws import DAMPING_LIMITS, lost_of, swing
 
-#: A Gauss-Markov drift keeps within the default model's correlation rates, 1/s: faster ones are coloured noise.
+#: Limits of a Gauss-Markov drift's correlation rate, 1/s, from the default model: faster noise is coloured noise.
 ALPHA_LIMITS = ABOUT_N["alpha"][:2]
-#: Sizes relative to the white noise of one sample.
+#: Limits of a size relative to the white noise of a sample.
 SIZE_LIMITS = (1e-5, 1e2)
-#: A drift that oscillates keeps within these periods, s: faster ones are a band.
+#: Limits of the period of a drift that oscillates, s: a faster oscillation is a band.
 PERIOD_LIMITS = (20.0, 3000.0)
 #: Limits of ln of a size.
 LN_SIZE = (math.log(SIZE_LIMITS[0]), math.log(SIZE_LIMITS[1]))
@@ -31,9 +31,9 @@ LN_SIZE = (math.log(SIZE_LIMITS[0]), math.log(SIZE_LIMITS[1]))
 @dataclass(frozen=True)
 class Parameter:
     """A number of a term: the field of `Terms` that it belongs to, its limits, where a fit starts (without: at the
-    middle), and where one starts that takes over another model's numbers.
+    middle), and where a fit starts that takes over another model's numbers.
 
-    `grows`: a size over the white noise of a mean goes as this power of its samples; 0 for what is no size. `drift`: a
+    `grows`: a size over the white noise of a mean goes as this power of its samples; 0 for another number. `drift`: a
     size of the drift, so that a smaller drift has less of it."""
 
     term: str
@@ -59,7 +59,7 @@ PARAMETERS = {
 
 @dataclass(frozen=True)
 class Terms:
-    """The terms of a noise model beside white noise: the drift's, 1/f noise, a damped oscillator that white noise
+    """The terms of a noise model besides white noise: the drift's, 1/f noise, a damped oscillator that white noise
     drives, and the colour of the white noise.
 
     `bands`: further oscillators, each with its period in s, damping and ln of its size, all fixed: refitting them with
@@ -79,7 +79,7 @@ class Terms:
 
     @cached_property
     def sizes(self) -> Mask:
-        """Of the parameters those that are ln of sizes of the drift."""
+        """Mask of the parameters that are ln of sizes of the drift."""
         return np.array([PARAMETERS[name].drift for name in self.names], bool)
 
     @cached_property
@@ -130,7 +130,7 @@ def flicker_rates(duration_s: float, dt: float) -> tuple[float, ...]:
 
 
 class _Part(NamedTuple):
-    """States of one term [m], as in `Matrices`; a number stands for a matrix of one state."""
+    """States of a term [m], as in `Matrices`; a number is the matrix of a single state."""
 
     states: int
     F: Array | float
@@ -142,7 +142,7 @@ class _Part(NamedTuple):
 
 
 def _parts(terms: Terms, value: Mapping[str, float], dt: float, duration_s: float, block: int) -> Iterator[_Part]:
-    """The terms' states, one term after the other. A kind of noise is a branch here and its rows of PARAMETERS."""
+    """The terms' states, term by term. A kind of noise is a branch here and its rows of PARAMETERS."""
 
     def markov(variance: float, rate: float) -> _Part:
         lost = variance * lost_of(rate * dt, block)

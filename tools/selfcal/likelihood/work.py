@@ -27,13 +27,13 @@ class Spent(Stopped):
 
 @dataclass
 class Work:
-    """What is left of it, and whether to stop now."""
+    """Work that is left, and whether to stop now."""
 
     stop: Callable[[], bool]
     left: float = math.inf
 
     def count(self, samples: int, columns: int) -> None:
-        """Raise Stopped or Spent before a pass of so many samples and columns."""
+        """Count a pass over `samples` with `columns`. Raise Stopped on a stop, or Spent if the work is used up."""
         if self.stop():
             raise Stopped
         self.left -= samples * (1.0 + columns)
@@ -45,12 +45,12 @@ _now: ContextVar[Work] = ContextVar("work", default=Work(lambda: False))  # noqa
 
 
 def count(samples: int, columns: int) -> None:
-    """As Work has it, of the work that goes on here."""
+    """`Work.count` of the work that goes on here."""
     _now.get().count(samples, columns)
 
 
 def of_axis(samples: int) -> Work:
-    """The work that an axis of so many samples may take."""
+    """The work that an axis of this many samples may take."""
     return Work(_now.get().stop, max(WORK_MOST, 2.0 * PASSES_MOST * samples))
 
 
@@ -65,7 +65,7 @@ def within(work: Work) -> Iterator[None]:
 
 
 def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """In threads: nearly all the time goes into the compiled filter and the transforms, which run side by side."""
+    """Call in threads: nearly all the time goes into the compiled filter and the transforms, which run side by side."""
     jobs = [(copy_context(), item) for item in items]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return list(pool.map(lambda job: job[0].run(function, job[1]), jobs))

@@ -38,12 +38,12 @@ def _is_frame(data: object) -> bool:
 def tables_of(
     data: Any, units: Mapping[str, str] | str, known: Collection[str], rate_hz: float | None, sensors: Collection[str]
 ) -> tuple[list[Table], dict[str, str]]:
-    """The tables of readings in memory, one for each sensor whose rows take turns, and the units that `units` states.
+    """The tables of readings in memory, a table for each sensor whose rows take turns, and the units that `units`
+    states.
 
     `data`: an array or a list [n], [n, 3] or [n, 6] of gx, gy, gz, ax, ay, az; a mapping of arrays [n] by heading, with
-    `gyro` and `accel` [n, 3]; a data frame or a series, whose index has the time if it is one of dates. `units`: of all
-    axes, or by name, where `gyro` and `accel` are their axes. `known`: names that an option maps to a column. Raises
-    UserError.
+    `gyro` and `accel` [n, 3]; a data frame or a series, whose index of dates is the time. `units`: of all axes, or by
+    name, where `gyro` and `accel` are their axes. `known`: names that an option maps to a column. Raises UserError.
     """
     arrays: dict[str, NDArray[Any]] = {}
     for heading, array in _columns(data):
@@ -109,7 +109,7 @@ def _numbers(what: str, values: Any) -> NDArray[Any]:
 
 
 def _axes(name: str, array: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
-    """The columns of a matrix, one row a sample."""
+    """The columns of a matrix with a row for each sample."""
     own, unit = split(name) if name else ("", None)
     columns = array[:, None] if array.ndim == 1 else array
     axes = _THREE.get(own) if own else _COLUMNS.get(columns.shape[1:])

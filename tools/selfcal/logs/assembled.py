@@ -24,13 +24,13 @@ from selfcal.logs.order import few_rows, in_order
 from selfcal.logs.recorded import SIDE_UNITS, Column, Recording, bridged, bridged_at
 from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, has_own_clock, remarks
 
-#: Readings of a side channel for each one of a run of wild ones.
+#: Fewest readings of a side channel for each reading of a wild run.
 READINGS_PER_WILD = 1000
 
 
 @dataclass(frozen=True)
 class _Stamps:
-    """Stamps float64[n], s from the first one; their rounding; the first one, s. Fail raises UserError for a row."""
+    """Stamps float64[n], s from the first; their rounding; the first stamp, s. `fail` raises UserError for a row."""
 
     time: Array
     noise_s: float
@@ -131,8 +131,8 @@ def _ordered(
 
 
 def _twice(time: Array, columns: Iterable[Array]) -> Rows:
-    """Rows of stamps and columns [n] that are an earlier one to the bit, where stamps fall; columns are formed there
-    alone. None where most rows that come late are others: a counter that wraps has some by chance."""
+    """Rows of stamps and columns [n] that repeat an earlier row to the bit, where stamps fall; columns are formed there
+    alone. Empty where most late rows are others: a counter that wraps repeats some by chance."""
     none = np.empty(0, np.int64)
     if not (np.diff(time) < 0.0).any():
         return none
@@ -195,7 +195,7 @@ def _on_clocks(
     """The recording of columns with NaN in `count` rows at their stamps, or at `rate` without any.
 
     Axes whose samples are spaced regularly, in two rows or more, get a clock of their own; the rows of the others are
-    those in which one of them has a sample.
+    those in which any of them has a sample.
     """
     known = {name: np.isfinite(column.values) for name, column in columns.items()}
     header.notes += [f"column '{name}' holds no number and is left out" for name, has in known.items() if not has.any()]
@@ -261,7 +261,7 @@ def _sampled(path: Path, axes: Mapping[str, Mask]) -> tuple[Rows, dict[str, list
 
 
 def _clock_at(rows: TableRows, rate: float | None, sampled: Rows, stamps: _Stamps | None, count: int) -> Clock:
-    """The clock of the samples in the rows `sampled` of so many."""
+    """The clock of the samples in the rows `sampled` of `count`."""
     if stamps is None:
         assert rate is not None
         lines = sampled if rows.places is None else rows.places[sampled]

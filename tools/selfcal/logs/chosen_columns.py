@@ -47,7 +47,7 @@ class Asked:
 
     @property
     def options(self) -> tuple[tuple[str, str], ...]:
-        """The same as the command line says it."""
+        """The options as the command line has them."""
         given = [] if self.rate is None else [("--rate", f"{self.rate:.15g}")]
         for option, pairs in (("--column", self.columns), ("--unit", self.units)):
             given += [(option, f"{name}={value}") for name, value in pairs.items()]
@@ -83,11 +83,11 @@ class Header:
         #: Columns of a table that lack a unit, or the size of a count: heading, name here, and the usual unit.
         self.without_unit: list[tuple[str, str, str]] = []
         self.without_size: list[tuple[str, str, str]] = []
-        #: Those without a unit that begin with a whole number.
+        #: Headings of columns without a unit that begin with a whole number.
         self.whole: set[str] = set()
 
     def of_part(self, several: bool) -> Header:
-        """The same for one of the file's parts."""
+        """The header for a part of the file."""
         part = copy(self)
         part.several, part.notes, part.without_unit, part.without_size = several, [], [], []
         part.damaged = SOUND
@@ -95,7 +95,7 @@ class Header:
         return part
 
     def knows_in(self, text: Text) -> Callable[[Sequence[str]], bool]:
-        """Whether one of a line's headings is a sensor's, in a text. Only so many are looked at."""
+        """Whether any heading of a line in a text is a sensor's. At most MOST_HEADINGS headings are looked at."""
         left = MOST_HEADINGS
 
         def knows(keys: Sequence[str]) -> bool:
@@ -126,7 +126,7 @@ class Header:
     def fields(
         self, keys: Sequence[str], where: str, described: Any, cells: Mapping[str, str], meant: Mapping[str, Meaning]
     ) -> list[Field]:
-        """One field for each column to read, in file order. `where` is put after the path in messages; `described` is
+        """A field for each column to read, in file order. `where` is put after the path in messages; `described` is
         what a meta text says of columns that are named plainly; `cells`: those of the first row of a text, by heading;
         `meant`: what `sensors_of` found of the sensor."""
         if not isinstance(described, dict) or not all(isinstance(entry, dict) for entry in described.values()):
@@ -243,7 +243,7 @@ class Header:
                 "unit that it is in"
             )
         counts = [column for column in self.without_unit if column[0] in self.whole]
-        if len({name for _, name, _ in counts}) < _COUNTS_FROM:  # one alone may be a whole number by chance
+        if len({name for _, name, _ in counts}) < _COUNTS_FROM:  # a single column may hold whole numbers by chance
             counts = []
         stated = [column for column in self.without_unit if column not in counts]
         typed = [f"--unit {name}={unit}" for name, unit in self._by_own_names(stated)]
@@ -258,7 +258,7 @@ class Header:
         return f"columns with {lacks}; give {' '.join(typed)}, or the units that they are in"
 
     def _by_own_names(self, columns: Sequence[tuple[str, str, str]]) -> list[tuple[str, str]]:
-        """For each option to type the name, quoted, and the unit. Columns of one matrix and kind share an option."""
+        """For each option to type the name, quoted, and the unit. Columns of a matrix and kind share an option."""
         typed: dict[str, str] = {}
         for key, name, unit in columns:
             own = [heading for heading in self._own_names(key) if "=" not in heading]

@@ -27,8 +27,8 @@ WRITTEN = (".asc", ".blf", ".csv", ".log", ".mcap", ".trc")
 #: Suffixes of binary logs.
 BINARY = (".blf", ".mcap")
 
-#: Of Vector's BLF: sizes of the file's header and of the file, then an object's signature, size and kind; a
-#: container's own header.
+#: Vector's BLF: sizes of the file's header and of the file, then an object's signature, size and kind; a container's
+#: own header.
 BLF_HEADER, BLF_OBJECT = struct.Struct("<4sL8xQ"), struct.Struct("<4s4xLL")
 BLF_CONTAINER, BLF_CONTAINER_HEAD, BLF_ZLIB = 10, 16, b"\x02\x00"
 
@@ -187,7 +187,7 @@ class FrameLog:
 
 
 def _is_cut(path: Path) -> bool:
-    """Whether a log of lines ends amid one: python-can may take the half of a frame for one, or pass it by."""
+    """Whether a log of lines ends within a line: python-can may take half a frame for a frame, or skip it."""
     with path.open("rb") as file:
         if path.suffix.lower() in BINARY or not file.seek(0, 2):
             return False
@@ -196,7 +196,7 @@ def _is_cut(path: Path) -> bool:
 
 
 def _check_frame(frame: can.Message, number: int) -> None:
-    """Raises _NoFrame for one that python-can's readers make of a damaged place."""
+    """Raise _NoFrame for a frame that python-can's readers make of a damaged place."""
     if not math.isfinite(frame.timestamp):
         raise _NoFrame(f"frame {number} has the time stamp {frame.timestamp:g}")
     plain = not (frame.is_fd or frame.is_remote_frame or frame.is_error_frame)
@@ -205,9 +205,9 @@ def _check_frame(frame: can.Message, number: int) -> None:
 
 
 class _Lines:
-    """The lines of a text log, as python-can's readers take a file. `malformed` counts those of which no frame comes.
+    """The lines of a text log, as python-can's readers take a file. `malformed` counts lines that give no frame.
 
-    A reader that stumbled over a line begins anew with the next one: an empty line takes the place of its header.
+    A reader that fails at a line restarts with the next line: an empty line takes the place of its header.
     """
 
     def __init__(self, path: Path) -> None:
@@ -263,7 +263,7 @@ class _Lines:
 
 
 class _Foreign:
-    """A reader of one frame a line, for forms that python-can has no reader of."""
+    """A reader of a frame for each line, for forms that python-can has no reader of."""
 
     def __init__(self, lines: _Lines, frame: Callable[[str], can.Message]) -> None:
         self._lines, self._frame = lines, frame
@@ -378,7 +378,7 @@ def _unpacked(path: Path, body: bytes) -> tuple[bytes, bool]:
 
 
 def _check_objects(path: Path, data: bytes) -> bytes:
-    """Walk through the objects of a container as python-can does; returns the beginning of one that goes on."""
+    """Walk through the objects of a container as python-can does; return the unfinished last object, else empty."""
     begin = 0
     while (begin := data.find(b"LOBJ", begin, begin + 8)) >= 0 and len(data) - begin >= BLF_OBJECT.size:
         _, size, _ = BLF_OBJECT.unpack_from(data, begin)
@@ -424,7 +424,7 @@ class McapFrames:
 
 
 def check_suffix(path: Path | str) -> None:
-    """Raise UserError for a name that chooses no format, or one whose library is not installed."""
+    """Raise UserError for a name that chooses no format, or a format whose library is not installed."""
     if Path(path).suffix.lower() not in WRITTEN:
         raise UserError(f"{path}: the name of a frame log ends in {', '.join(WRITTEN)}")
     if str(path).lower().endswith(".mcap") and find_spec("mcap") is None:

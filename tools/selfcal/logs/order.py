@@ -23,7 +23,7 @@ _BITS, _TICKS = (32, 24, 16), (1e-6, 1e-3)
 _CLOCKS = {3600.0: "an hour", 43200.0: "half a day", 86400.0: "a day", 604800.0: "a week"}
 #: Chance that stamps that fall come so near a span.
 _BY_CHANCE = 0.01
-#: Rows a damaged one at least, and rows to either side that show which of them it is.
+#: Fewest rows for each damaged row, and rows to either side that show which row is damaged.
 _DAMAGED_APART, _NEAR = 20, 16
 
 
@@ -87,9 +87,9 @@ def _spans(time: Array, steps: Array, tick_s: float) -> list[float]:
 
 
 def broken(time: Array) -> tuple[int, str] | None:
-    """The first row whose stamp is not later than the one before, and the words; None where the stamps will do.
+    """The first row whose stamp is not later than the stamp before, and the words; None where the stamps will do.
 
-    Stamps may repeat for being coarse. They may fall where batches of one length overlap."""
+    Stamps may repeat for being coarse. They may fall where batches of equal length overlap."""
     steps = np.diff(time)
     back, repeats = steps < 0.0, steps == 0.0
     if back.any() and not batches_overlap(time):
@@ -109,7 +109,7 @@ def mends(time: Array) -> bool:
 
 
 def few_rows(rows: int, of: int) -> bool:
-    """Whether so many rows may be damaged ones."""
+    """Whether `rows` of `of` rows are few enough to be damaged."""
     return rows * _DAMAGED_APART <= of
 
 

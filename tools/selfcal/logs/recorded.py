@@ -1,4 +1,4 @@
-"""A recording: columns on clocks, one value for all that follows."""
+"""A recording: columns on clocks, as a value for all later steps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from selfcal.base.limits import FEWEST_ROWS, LONGEST_S
 from selfcal.logs.loaders.damage import SOUND, Damaged
 from selfcal.logs.timebase import Clock
 
-#: Columns that are no axis but may explain one, by cause: name and unit.
+#: Columns that are no axis but may explain an axis, by cause: name and unit.
 SIDE_CHANNELS = MappingProxyType({"temperature": ("temp", "degC"), "supply": ("supply", "V")})
 #: Their units, by name.
 SIDE_UNITS = MappingProxyType(dict(SIDE_CHANNELS.values()))
@@ -28,7 +28,7 @@ SIDE_UNITS = MappingProxyType(dict(SIDE_CHANNELS.values()))
 
 @dataclass(frozen=True)
 class Column:
-    """One column: `values` float64[n] in `unit`, n the samples of its `clock`, by default the recording's.
+    """A column: `values` float64[n] in `unit`, n the samples of its `clock`, by default the recording's.
 
     An axis is NaN where it has no sample and another axis has; all other values are finite.
     """
@@ -46,7 +46,7 @@ class Recording:
     `off_grid_s` float64[n]: time stamp minus the even grid's, s; None without stamps. `start_s`: where in the file's
     recording the first row is, s. `since_power_on_s`: from power-on to the file's first row, s. `moving_before`,
     `moving`: samples left out for motion (`Clock`). `started_s`: the first stamp, s. `notes`: what a reader of the
-    results must know of the file, one line each.
+    results must know of the file, a line each.
     """
 
     path: Path
@@ -61,7 +61,7 @@ class Recording:
     started_s: float | None = None
     since_power_on_s: float = 0.0
     notes: tuple[str, ...] = ()
-    #: What of the files could not be read.
+    #: Damage: parts of the files that could not be read.
     damaged: Damaged = SOUND
     #: The files, where there are several: `path` has them all for messages.
     paths: tuple[Path, ...] = ()
@@ -153,7 +153,7 @@ class Recording:
 
     def between(self, start_s: float | None, end_s: float | None) -> Recording:
         """The stretch from `start_s` on and before `end_s`, seconds of the recording. Raises UserError for an empty
-        one, and for one that lies outside."""
+        stretch, and for a stretch outside."""
         if start_s is None and end_s is None:
             return self
         for option, value in (("--start", start_s), ("--end", end_s)):
@@ -193,9 +193,9 @@ class Recording:
         return units.converted(column.values, column.unit, unit)
 
     def along(self, *names: str) -> Recording:
-        """The recording by the clock of these axes: its rows are those in which one of them has a sample.
+        """The recording by the clock of these axes: its rows are those in which any of them has a sample.
 
-        A row without one is missing. All other columns are bridged by straight lines where they have no sample.
+        A row without a sample is missing. All other columns are bridged by straight lines where they have no sample.
         Raises UserError for axes of several clocks.
         """
         own = {id(self.columns[name].clock) for name in names}

@@ -1,8 +1,8 @@
 """Recordings of a resting sensor: read, check, and write. The formats are read by `loaders/`.
 
-Text has one header row of `name[unit]`. An npz has one 1-D array a column, named like the header, or named plainly
+Text has a header row of `name[unit]`. An npz has a 1-D array for each column, named like the header, or named plainly
 with unit and LSB in a JSON text `meta`: {"rate_hz": 100.0, "columns": {"gx": {"unit": "deg/s", "lsb": 0.05}}}. A text
-file may have such a text as LOG.meta.json. Every fault raises UserError with file, line and column in one line.
+file may have this text as LOG.meta.json. Every fault raises UserError with file, line and column in one line.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _GRAVITY = {"g": 1.0, "mg": 1000.0, "m/s^2": units.STANDARD_GRAVITY, "mm/s^2": 1
 _GRAVITY_OFF, _AT_REST, _GRAVITY_S = 0.05, 0.9, 1.0
 
 
-#: A file, several ones that are joined, or readings in memory: a Recording, an array, a mapping of arrays, a frame.
+#: A file, several files that are joined, or readings in memory: a Recording, an array, a mapping of arrays, a frame.
 Data: TypeAlias = "Path | str | Sequence[Path | str] | Recording | NDArray[Any] | Mapping[str, Any] | Any"
 
 
@@ -164,8 +164,8 @@ def check_column(recording: Recording, name: str, asked: str = "", needed: str =
 
 
 def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
-    """The sensors of one file that are meant, or of the tables that are `there`, and their temperatures, each
-    by its own clock."""
+    """The sensors of a file that are meant, or of the tables that are `there`, and their temperatures, each by its own
+    clock."""
     path, wanted = header.path, header.asked.sources
     hints: Hints = {} if header.asked.dbc is None else {"dbc": str(header.asked.dbc)}
     with reading(path, "not a sound recording"):
@@ -203,7 +203,7 @@ def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
 
 
 def _parts(header: Header, table: Table, several: bool) -> list[Share]:
-    """The sensors of a table, and the temperature in one without any."""
+    """The sensors of a table, or the temperature in a table without sensors."""
     keys = table.keys
     sensors = header.sensors_of(keys, table.name, table.before)
     sides = sides_of(keys) if several and not sensors else None
@@ -286,7 +286,7 @@ def _span(stamps: NDArray[Any], unit: str | None) -> tuple[int, float]:
 
 
 def _joined(files: Sequence[Path], recordings: Sequence[Recording], header: Header) -> Recording:
-    """Parts of one recording as one: the columns of the fastest sensor keep its clock, others have their own."""
+    """Join the parts of a recording: the columns of the fastest sensor keep its clock, others have their own."""
     sensors = [
         part for part in recordings if not header.sensors or any(name in header.sensors for name in part.columns)
     ]

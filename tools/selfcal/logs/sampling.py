@@ -1,7 +1,7 @@
-"""Interval and missing samples from time stamps, by one likelihood.
+"""Interval and missing samples from time stamps, by a likelihood.
 
-Sample n was taken at n dt and stamped a little later; some samples have no stamp. Stamps may be rounded to a lattice.
-A law says which n each stamp has; it costs the nats that write the stamps by it: the errors to one cell by the best
+Sample n was taken at n dt and stamped a little later; some samples have no stamp. Stamps may be rounded to a lattice. A
+law says which n each stamp has; it costs the nats that write the stamps by it: the errors to a cell by the best
 histogram, the missing samples, its numbers. The cheapest law is taken. The laws:
 
 - an even grid, whose phase is followed where stamps jitter (`_phased`), or kept within the lattice (`_within`,
@@ -113,7 +113,7 @@ _PATTERN_GAPS_MOST = 4
 
 
 class Ambiguous(ValueError):
-    """The stamps do not tell the rate; the text says why."""
+    """The stamps do not show the rate; the text says why."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class _Stamps:
 
     @cached_property
     def slept(self) -> Array:
-        """Beyond one usual step, so far, [n], s."""
+        """Time of pauses so far, beyond a usual step each, [n], s."""
         steps = np.diff(self.time)
         extra = np.where(self.asleep, steps - _usual(steps), 0.0)
         return np.concatenate(([0.0], np.cumsum(extra)))
@@ -165,7 +165,7 @@ class _Stamps:
         return self.lattice > 0.0 and _is_multiple(dt, self.lattice)
 
     def whole(self, dt: float) -> bool:
-        """Whether an interval is a multiple of the lattice, or the lattice one of it."""
+        """Whether an interval is a multiple of the lattice, or the lattice a multiple of the interval."""
         return self.multiple(dt) or _is_multiple(self.lattice, dt)
 
     def fit(self, dt: float, missing: Rows, errors: Array, patterned: bool = True) -> _Fit:
@@ -178,7 +178,7 @@ class _Stamps:
 
     def ln_values(self, values: Array) -> float:
         """Nats that write values [n] to a cell by the best histogram, of cells 2^k wide at any of some places."""
-        # Values of one lattice are not parted by its noise.
+        # The noise does not part values of a lattice.
         part = np.floor((np.sort(values - values.min()) + 4.0 * self.noise) * (_CELL_PLACES / self.cell) + 1e-6)
         first = np.flatnonzero(np.diff(part, prepend=-1.0))
         part, times, n = part[first], np.diff(first, append=part.size), part.size
@@ -220,8 +220,8 @@ def _is_multiple(length: float, unit: float) -> bool:
 
 
 def sampling(time: Array, noise_s: float, rate: float | None) -> tuple[float, Rows]:
-    """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing but where
-    batches of one length overlap).
+    """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing but where batches of
+    equal length overlap).
 
     `noise_s`: their rounding noise. `rate`: the stated rate (Hz) if there is one, which is a prior. Raises Ambiguous.
     A second at most but for coarse stamps: 10^6 rows take another second.
@@ -246,7 +246,7 @@ def sampling(time: Array, noise_s: float, rate: float | None) -> tuple[float, Ro
 
 
 def _stamps(time: Array, noise_s: float) -> _Stamps:
-    """Stamps with what one look shows of them. Raises Ambiguous."""
+    """Stamps with their pauses, lattice and typical step. Raises Ambiguous."""
     time, steps = time - time[0], np.diff(time)
     usual = _usual(steps)
     if not time[-1] < _INTERVALS_MOST * usual:
@@ -313,8 +313,8 @@ def _asleep(time: Array, steps: Array) -> Mask:
 
 
 def _ln_losses(steps: Rows, patterned: bool) -> float:
-    """Nats that write steps of whole intervals [m]: samples lost one by one, in runs, in runs of any length, or in a
-    pattern of a few gaps, if that can be."""
+    """Nats that write steps of whole intervals [m]: samples lost singly, in runs, in runs of any length, or if
+    `patterned` in a pattern of a few gaps."""
     n, lost = steps.size, int(steps.sum()) - steps.size
     if lost <= 0:
         return 0.0
@@ -338,7 +338,7 @@ _Law = Callable[[_Stamps, float], _Fit | None]
 
 
 def _counted(stamps: _Stamps, _: float) -> _Fit:
-    """Steps of any length, of which the very long ones alone are gaps, unless samples that come at once make up for
+    """Steps of any length, of which very long steps alone are gaps, unless samples that come at once make up for
     them."""
     time, index = stamps.awake, np.arange(stamps.time.size)
     steps, missing = np.diff(time), np.zeros(index.size, np.int64)
@@ -416,7 +416,7 @@ def _exactly(stamps: _Stamps, dt: float) -> _Fit | None:
 
 
 def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
-    """Of samples that are stamped within so large a share of a lattice step. None where they are not."""
+    """The law of samples that are stamped within a `share` of a lattice step, else None."""
     best, index, asleep = None, np.arange(stamps.time.size), np.append(False, stamps.asleep)
     slack, first = share * stamps.lattice, (0.0, share * stamps.lattice)
     for again in range(5):
@@ -424,7 +424,7 @@ def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
         if odd > 0.05 * index.size + 3:
             break
         sample = index + np.cumsum(missing)
-        # A sample lost at once leaves the first sample open; later ones tell the phase.
+        # A sample lost at once leaves the first sample open; later samples show the phase.
         phase = float(np.median((stamps.time - sample * dt)[:_PHASE_ROWS])) + 0.5 * slack
         first = (phase - 0.1 * slack, phase + 0.1 * slack)
         fitted = _slope(sample, stamps.time)
@@ -440,8 +440,8 @@ def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
 
 
 def _decode(time: Array, dt: float, slack: float, first: tuple[float, float]) -> tuple[Rows, int]:
-    """missing_before[n], and the number of stamps that fit nowhere. [lo, hi]: where the sample's true time can be, of
-    the `first` one given."""
+    """missing_before[n], and the number of stamps that fit nowhere. [lo, hi]: where the sample's true time can be;
+    `first`: of the first sample."""
     missing = np.zeros(time.size, np.int64)
     stamps = time.tolist()
     lo, hi, odd = *first, 0
@@ -501,7 +501,7 @@ def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
 
 
 def rhythm(gaps: Rows) -> tuple[float, float]:
-    """Evidence, nats net, that most gaps [k] are whole multiples of one period, and the period: near the median, or a
+    """Evidence, nats net, that most gaps [k] are whole multiples of a period, and the period: near the median, or a
     part of the short ones. Chance spreads the gaps evenly over it."""
     if gaps.size < 2:
         return 0.0, 1.0
@@ -526,17 +526,17 @@ def rhythm(gaps: Rows) -> tuple[float, float]:
 
 
 def in_rhythm(rows: Rows) -> bool:
-    """Whether rows are whole multiples of one period apart."""
+    """Whether rows are whole multiples of a period apart."""
     return rhythm(np.diff(rows))[0] > _SURE_NATS
 
 
 def in_pattern(steps: NDArray[np.floating[Any]] | Rows) -> bool:
-    """Whether the steps of more than one interval, of those steps [n - 1], come again in periods of a few."""
+    """Whether the steps [n - 1] that are longer than an interval recur in periods of a few."""
     return any(np.mean(same) >= _PATTERN_LEAST for _, same in _periods(steps))
 
 
 def _periods(steps: NDArray[np.floating[Any]] | Rows) -> list[tuple[int, Mask]]:
-    """By the number of gaps in a period, which of the steps of more than one interval are as a period before."""
+    """By the number of gaps in a period, which steps longer than an interval are as a period before."""
     rows = np.flatnonzero(steps > 1.0)
     each = np.stack([np.diff(rows), steps[rows[1:]]]) if rows.size > _BURST_LEAST else np.zeros((2, 0))
     periods = range(1, 1 + min(_PATTERN_GAPS_MOST, each.shape[1] - 1))
@@ -603,7 +603,8 @@ def rate_changes(time: Array) -> list[RateChange]:
     """Every change of rate in stamps float64[n], s, in order of time: where the laws of the stamps on its two sides
     have another interval.
 
-    A rate must last two pieces of n / _RATE_PIECES rows, of 3 * _RATE_STEPS; one that differs much, of _RATE_STEPS."""
+    A rate must last two pieces of n / _RATE_PIECES rows, of 3 * _RATE_STEPS. A rate that differs much: of
+    _RATE_STEPS."""
     return _changes(time, 3 * _RATE_STEPS) or _changes(time, _RATE_STEPS)
 
 
@@ -638,7 +639,7 @@ def _changes(time: Array, least: int) -> list[RateChange]:
     scatter, changes = max(RATE_CHANGE_LEAST, _scatter(value, parts)), list[RateChange]()
     for row, (before, after) in zip(rows[1:-1], pairwise(intervals), strict=True):
         ratio = math.log(after / before)
-        # A burst after a stall makes up for it: samples of one rate, stamped late.
+        # A burst after a stall makes up for it: samples of the same rate, stamped late.
         late = steps[max(0, row - 3) : row + 2].max() > _RATE_STEPS * max(before, after)
         if late or abs(ratio) < max(0.5 * RATE_CHANGE_LEAST, unsure):
             return []
@@ -655,8 +656,8 @@ def _interval(time: Array, lattice: float) -> float:
 
 
 def _constant(value: Array, least: float) -> list[tuple[int, int]]:
-    """First piece and the piece after the last of every part of one rate. `value` [pieces]: ln of the interval, whose
-    changes are `least` or more. A piece with a change in it belongs to no part.
+    """First piece and the piece after the last of every part of constant rate. `value` [pieces]: ln of the interval,
+    whose changes are `least` or more. A piece with a change in it belongs to no part.
 
     The sum of squares about the levels of the parts, and a price for each part, is the least (optimal partition).
     """
@@ -684,8 +685,8 @@ def _constant(value: Array, least: float) -> list[tuple[int, int]]:
 
 
 def _scatter(value: Array, parts: list[tuple[int, int]]) -> float:
-    """Distance from the level of its part that one piece in ten exceeds, the largest of all parts of ten pieces and of
-    all together."""
+    """Distance from the level of its part that a tenth of the pieces exceeds, the largest of all parts of ten pieces
+    and of all together."""
     off = [np.abs(value[a:b] - np.median(value[a:b])) for a, b in parts]
     return max(
         float(np.quantile(each, 0.9)) for each in [np.concatenate(off), *(each for each in off if each.size >= 10)]
@@ -706,7 +707,7 @@ def _bend(
 
 
 def common_step(steps: Array, tolerance: float) -> float:
-    """Step, s, of the lattice that all time stamps lie on: the steps are multiples of it. 0 where there is none."""
+    """Step, s, of the lattice that all time stamps lie on: the steps are multiples of it. Else 0."""
     ordered = steps[steps > tolerance]
     ordered.sort()
     if ordered.size == 0:
@@ -727,7 +728,7 @@ def common_step(steps: Array, tolerance: float) -> float:
 
 
 def followed_phase(x: Array, time: Array, frequency: float, block: int) -> tuple[Array, float]:
-    """Phase [n], turns, of the line near a frequency in x [n] at these times, followed over blocks of so many rows; and
+    """Phase [n], turns, of the line near a frequency in x [n] at these times, followed over blocks of `block` rows; and
     the size of the line. It is whole where x is largest."""
     edges = np.arange(0, max(1, x.size // block)) * block
     middle = np.add.reduceat(time, edges) / np.diff(edges, append=x.size)

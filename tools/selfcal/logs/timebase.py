@@ -29,12 +29,12 @@ from selfcal.logs.sampling import (
     sampling,
 )
 
-#: Largest difference of the stamps' rate from a stated one, as a share. A lattice of stamps that agrees so with the
+#: Largest difference of the stamps' rate from a stated rate, as a share. A lattice of stamps that agrees so with the
 #: interval may be the interval, of which samples are lost.
 _AGREES = 0.1
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
 _NO_GRID = 0.3
-#: Samples in a period of losses, and changes of the rate, that a line tells of, at most.
+#: Most samples in a period of losses, and most changes of the rate, that a line states.
 _OF_LOSSES, _IN_WORDS = 100, 3
 #: The way on for stamps of no use.
 AS_THEY_COME = "--no-time --rate HZ takes the rows of one file as they come"
@@ -48,8 +48,8 @@ class Clock:
     """When n samples were taken: an even grid of `rate_hz` that begins `start_s` after the recording does.
 
     `missing_before` int64[n]: samples missing just before each. `off_grid_s` float64[n]: stamp minus grid, s; None
-    without stamps. `moving_before` int64[n]: how many of the missing ones were measured, and left out for motion; None:
-    none. `moving` counts all that were left out for it, those beyond either end too.
+    without stamps. `moving_before` int64[n]: how many of the missing samples were measured, and left out for motion;
+    None: 0. `moving` counts all samples left out for motion, those beyond either end too.
     """
 
     rate_hz: float
@@ -96,7 +96,7 @@ class Clock:
         return Clock(self.rate_hz, missing, off_grid, start, moved, count)
 
     def alike(self, other: Clock) -> bool:
-        """Whether both are one clock."""
+        """Whether both are the same clock."""
         return (
             abs(self.rate_hz / other.rate_hz - 1.0) < SAME_INTERVAL
             and abs(self.start_s - other.start_s) * self.rate_hz < ONE_INSTANT
@@ -194,7 +194,7 @@ def remarks(clock: Clock) -> list[str]:
 
 
 def _losses(step: float) -> tuple[int, int, str]:
-    """Samples lost, of how many, and the words, where the mean step is so many intervals."""
+    """Samples lost, of how many, and the words, where the mean step is `step` intervals."""
     share = Fraction(1.0 - 1.0 / step).limit_denominator(_OF_LOSSES)
     lost, every = share.numerator, share.denominator
     return lost, every, f"{lost} sample{'s' * (lost > 1)} in {every}"

@@ -32,7 +32,7 @@ from selfcal.logs.timebase import Clock
 
 #: Headings, without a unit, of the columns that are not the recording's.
 SAMPLE, LATE = "sample", "late"
-#: Lines that are written at once; signs that separate columns, and so are none of a heading.
+#: Lines that are written at once; signs that separate columns, so no heading has them.
 _LINES, _SIGNS = 10_000, re.compile(r'[,;\t"]')
 #: What `meta` of the log says of the log's own table.
 _OF_TABLE = ("columns", "rows", "rate_hz")
@@ -93,7 +93,7 @@ def stated(meta: Mapping[str, Any]) -> bool:
 
 def _rows(stamps: Sequence[Array], near_s: float) -> tuple[Array, list[Rows]]:
     """Stamps of the rows, float64[n], s, and the rows of each clock's samples. Stamps of several clocks that are nearer
-    than `near_s` share a row; each sample of one clock has a row of its own."""
+    than `near_s` share a row; each sample of the same clock has a row of its own."""
     if len(stamps) == 1:
         return stamps[0], [np.arange(stamps[0].size)]
     time, clock = np.concatenate(stamps), np.repeat(np.arange(len(stamps)), [own.size for own in stamps])
@@ -115,9 +115,9 @@ def _rows(stamps: Sequence[Array], near_s: float) -> tuple[Array, list[Rows]]:
 def clocks_of(
     path: object, meta: Mapping[str, Any], t: Array, marks: Mapping[str, Array], places: Rows | None
 ) -> list[tuple[list[str], Clock, Rows]]:
-    """Of each clock that `meta` states the columns' names, the clock and the rows of its samples in a table with the
-    stamps `t` [n], s, and the further columns `marks`. `places` [n]: lines of the rows, some of which
-    were skipped. Raises UserError."""
+    """For each clock that `meta` states: the columns' names, the clock and the rows of its samples in a table with the
+    stamps `t` [n], s, and the further columns `marks`. `places` [n]: lines of the rows, some of which were skipped.
+    Raises UserError."""
     clocks = []
     for number, (entry, ending) in enumerate(zip(meta["clocks"], _endings(len(meta["clocks"])), strict=True)):
         mark = marks.get(SAMPLE + ending)

@@ -37,7 +37,7 @@ from selfcal.model.laws import (
 
 SCHEMA = "selfcal.model/1"
 DEFAULT = Path(__file__).parent / "models" / "default.yaml"
-#: Model files of common parts, one a part; the default model is that of the ADIS16405.
+#: Model files of common parts, a file each; the default model is for the ADIS16405.
 PARTS_FOLDER = DEFAULT.parent / "parts"
 DEFAULT_PART = "adis16405"
 
@@ -72,7 +72,7 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
     "turn_on": ("tau_s",),
     "pulse": ("start_s", "end_s"),
 }
-#: Most hypotheses of one model, in the host's library and on the wire.
+#: Most hypotheses of a model, in the host's library and on the wire.
 MOST_HYPOTHESES: int = _library32.HYPOTHESES_MAX
 #: Most columns of a bank's regressors together, and most that a model file may state.
 MOST_BANK_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
@@ -80,7 +80,7 @@ MOST_BANK_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of one parameter: `normal` (mean 0, `sd`), or `log_uniform` / `uniform` from `min` to `max`.
+    """Prior of a parameter: `normal` (mean 0, `sd`), or `log_uniform` / `uniform` from `min` to `max`.
 
     `log_normal`: the logarithm is normal about the middle of its limits, which lie LOG_NORMAL_REACH `sd` away."""
 
@@ -102,7 +102,7 @@ class Prior:
 
     @property
     def ln_sd(self) -> float:
-        """sd of the logarithm; of a uniform prior that of a log-uniform one, as the library has it."""
+        """sd of the logarithm; of a uniform prior as if it were log-uniform, as the library has it."""
         return self.sd if self.law == "log_normal" else math.log(self.max / self.min) / math.sqrt(12.0)
 
     def ln_density(self, ln_value: Array) -> Array:
@@ -126,7 +126,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Group:
-    """Axes of one kind: their unit, read-out and priors (keys bias, N, K, sigma_m, alpha, and B and the ratios if a
+    """Axes of a kind: their unit, read-out and priors (keys bias, N, K, sigma_m, alpha, and B and the ratios if a
     hypothesis has them; units of `units.py`). `laws`: the model's, by the names of its hypotheses. `own_priors`: by
     axis, those that take the place of the group's."""
 
@@ -147,8 +147,8 @@ class Regressor:
 
     `sd`: by group, the standard deviation of the coefficient's normal prior about 0, in the group's unit per `unit`; a
     group that is not there does not have this regressor. `reference`: the value at which x0 alone is the bias.
-    `probability`: prior one that the regressor is in use. `form` and its numbers: forms.py. `unit` is the column's,
-    `channel_unit` that of the channel it is formed from.
+    `probability`: prior probability that the regressor is in use. `form` and its numbers: forms.py. `unit` is the
+    column's, `channel_unit` that of the channel it is formed from.
     """
 
     name: str
@@ -195,7 +195,7 @@ class Regressor:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of its columns: a periodic one has a sine and a cosine."""
+        """Names of its columns: a periodic regressor has a sine and a cosine."""
         return (f"{self.name}.sin", f"{self.name}.cos") if self.kind == "periodic" else (self.name,)
 
 
@@ -230,15 +230,15 @@ class Handling:
 NOT_HANDLED = Handling()
 
 
-#: Filter nodes of one target, by hypothesis: of rho, and of alpha or the ratio if the law has one.
+#: Filter nodes of a target, by hypothesis: of rho, and of alpha or the ratio if the law has one.
 GridNodes = Mapping[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
 class HiddenInput:
-    """One quantity that nobody recorded and that moves several axes, a Gauss-Markov process: its standard deviation,
-    its bandwidth `alpha`, 1/s, what a unit of it does to each axis, in the axis' unit, and the correlation of the white
-    noise of pairs of axes (`gx-gy`). The bank of one axis knows nothing of it: its law is the axis' total."""
+    """A quantity that nobody recorded and that moves several axes, a Gauss-Markov process. Its standard deviation, its
+    bandwidth `alpha`, 1/s, what a unit of it does to each axis, in the axis' unit, and the correlation of the white
+    noise of pairs of axes (`gx-gy`). The bank of an axis knows nothing of it: its law is the axis' total."""
 
     deviation: float
     alpha: float
@@ -277,7 +277,7 @@ class Model:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Columns of a recording that may be axes: the usual ones, and the model's own."""
+        """Columns of a recording that may be axes: the usual axes, and the model's own."""
         return tuple(dict.fromkeys((*SENSORS, *self.axes)))
 
     @property
@@ -394,7 +394,7 @@ class _Loader(yaml.SafeLoader):
 
 def read_yaml(path: Path, kind: str) -> dict[str, Any]:
     """The mapping of a YAML file of at most MOST_MODEL_BYTES. `kind`: a name for messages, remarks in brackets after
-    it. Raises UserError, with the line where there is one."""
+    it. Raises UserError, with the line if known."""
     plain = kind.split(" (")[0]
     try:
         text = read_text(path, MOST_MODEL_BYTES, "not a text file")
@@ -569,8 +569,8 @@ class _Reader:
         group: Mapping[str, Prior] | None = None,
         of_laws: Collection[str] = (),
     ) -> dict[str, Prior]:
-        """Priors of the parameters `names`; those that are not there are the `group`'s, if there is one. Else those
-        `of_laws` must be there, and another one lies about N as in the default model."""
+        """Priors of the parameters `names`; missing priors are the `group`'s, if given. Else those `of_laws` must be
+        there, and another prior lies about N as in the default model."""
         trees = self.only(tree, ("bias", *PLACES), where)
         priors = dict(group or {})
         for key in names:

@@ -15,7 +15,7 @@ from selfcal.base.grid import Array
 
 #: Forms, the simplest first.
 FORMS = ("static", "lag", "rate", "square", "cube", "play", "delay", "free")
-#: Those that no module makes.
+#: Forms that no module makes.
 HOST_FORMS = ("play", "delay", "free")
 #: Entry with a form's number.
 NUMBER = {"lag": "lag_s", "rate": "window_s", "play": "width", "delay": "delay_s"}
@@ -54,7 +54,7 @@ def made(
 ) -> Array:
     """[n, sources]: columns of the channels `rows` [n, c], as a module forms them, in float32.
 
-    Sample i follows `missing[i]` absent ones, the first one power-on by `powered`."""
+    Sample i follows `missing[i]` absent samples, the first sample power-on by `powered`."""
     gaps = np.zeros(len(rows), np.uint64) if missing is None else np.ascontiguousarray(missing, np.uint64)
     columns = _library32.form(list(sources), interval_s, np.ascontiguousarray(rows, np.float32), gaps, powered)
     return np.ascontiguousarray(columns, np.float64)
@@ -110,7 +110,7 @@ def played(values: Array, width: float) -> Array:
 
 
 def delayed(values: Array, samples: float, missing: NDArray[np.integer[Any]] | None = None) -> Array:
-    """[n]: `values` [n] so many samples later."""
+    """[n]: `values` [n], `samples` samples later."""
     at = np.arange(values.size, dtype=np.float64)
     at += 0.0 if missing is None else np.cumsum(missing)
     return np.asarray(np.interp(at - samples, at, values))

@@ -17,13 +17,13 @@ import numpy as np
 from selfcal import _library32
 from selfcal.base.grid import Array
 
-#: Most terms of one law, states of its drift and coloured noise together.
+#: Most terms of a law, states of its drift and coloured noise together.
 MOST_TERMS: int = _library32.TERMS_MAX
 #: Limits of the factors of a deviation and a bandwidth.
 FACTORS: tuple[float, float] = _library32.FACTORS
 #: Parameters of every group's priors, in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
-#: Place of each parameter there. No law has two of one place.
+#: Place of each parameter there. No law has two at a place.
 PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3, "markov_ratio": 3}
 #: Parameters without a unit, and their limits: beyond, 1 + theta or 1 - theta is no longer a float.
 RATIOS = ("spectral_ratio", "markov_ratio")
@@ -43,7 +43,7 @@ LawTuple = tuple[list[tuple[int, float, float, bool, bool]], bool]
 
 @dataclass(frozen=True)
 class Term:
-    """One term of a drift. `deviation` multiplies the law's drift parameter, with `by_ratio` the law's ratio does too.
+    """A term of a drift. `deviation` multiplies the law's drift parameter, with `by_ratio` the law's ratio does too.
 
     `bandwidth` of a Gauss-Markov term multiplies alpha; if `stated` it is the bandwidth itself, 1/s. Of an oscillation
     it is 2 pi / period, always stated, and `damping` the damping ratio.
@@ -59,7 +59,7 @@ class Term:
 
 class Sized(NamedTuple):
     """A term at values of its law's parameters, numbers or arrays: `variance` of a step in 1 s of a walk, at the `rate`
-    0, else the stationary one. Of an oscillation `rate` is 2 pi / period."""
+    0, else the stationary variance. Of an oscillation `rate` is 2 pi / period."""
 
     kind: str
     variance: Any
@@ -80,7 +80,7 @@ class TermKind:
 
     `later(term, time_s)` and `averages(term, dt_s, block)`: the term ahead, and in means of `block` readings. `keys`:
     entries of a term in a model file, apart from kind and deviation. `time`: the entry of its time, which is `turn`
-    over the bandwidth and within `times` bank intervals; "" without one. `needs_time`: an unknown time is refused.
+    over the bandwidth and within `times` bank intervals; "" without a time. `needs_time`: an unknown time is refused.
     `read`: weight of each state in a reading. `counts`: remark on a law with too many terms.
     """
 
@@ -180,7 +180,7 @@ class Law:
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
-        """Names of its parameters: N, the drift parameter, the second one; those it has."""
+        """Names of its parameters: N, the drift parameter, the second parameter; those it has."""
         drift = self.drift_name or ("K" if self.has_walk else "sigma_m") if self.terms else ""
         return tuple(name for name in ("N", drift, self.second) if name)
 
@@ -218,7 +218,7 @@ class Law:
         return variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
 
     def sized(self, drift: Any, second: Any) -> Iterator[Sized]:
-        """Each term at the drift parameter and the second one, as `node` has them. Beside a walk the drift parameter is
+        """Each term at the drift parameter and the second one, as `node` has them. With a walk the drift parameter is
         K, and a term of rate w has the deviation K / sqrt(w)."""
         for term in self.terms:
             rate = self.bandwidth(term) * (1.0 if term.stated else second)
@@ -282,13 +282,13 @@ NAMED: dict[str, Law] = {
     "constant": Law(),
     "random_walk": Law((Term("walk"),)),
     "gauss_markov": Law((Term("markov"),)),
-    # Its two-sided spectrum is B^2 / (2 pi f) within 16 % where 2 pi f is between the outer ones. In the mean over
-    # ln f it is within 1 %. A factor of 10 comes nearer, but it covers less: on 1/f noise B came out 4 to 7 % too high.
+    # Its two-sided spectrum is B^2 / (2 pi f) within 16 % for 2 pi f between the outer bandwidths. In the mean over ln
+    # f it is within 1 %. A factor of 10 comes nearer, but it covers less: on 1/f noise B came out 4 to 7 % too high.
     "flicker": Law(tuple(Term("markov", 0.96, ratio) for ratio in (0.0625, 1.0, 16.0)), drift_name="B"),
     "moving_average": Law((Term("walk"),), coloured_noise=True),
     "walk_and_markov": Law((Term("walk"), Term("markov", bandwidth=math.nan, stated=True, by_ratio=True))),
 }
-#: Laws of several terms, and of one, which are the paper's.
+#: Laws of several terms, and laws of a single term, which are the paper's.
 SUMS = tuple(name for name, law in NAMED.items() if law.is_sum)
 PLAIN = tuple(name for name, law in NAMED.items() if not law.is_sum)
 

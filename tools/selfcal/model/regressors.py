@@ -67,7 +67,7 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> Array:
 
 
 def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regressor, ...]:
-    """The regressors for a clock that begins at `start_s` of the one that their times are of."""
+    """The regressors for a clock that begins at `start_s` of the clock of their times."""
 
     def moved(regressor: Regressor) -> Regressor:
         if regressor.kind == "step":
@@ -127,7 +127,7 @@ def offered(model: Model, axis: str) -> Choice:
 
 
 def choices_of(regressors: Choice) -> list[Choice]:
-    """Every subset, the empty one first."""
+    """Every subset, the empty subset first."""
     return [choice for count in range(len(regressors) + 1) for choice in itertools.combinations(regressors, count)]
 
 

@@ -37,7 +37,7 @@ SHEET_TIME_S = 100.0
 
 
 def generator(law: str, seed: int, stream: int) -> np.random.Generator:
-    """Random numbers of one part: a stream for each of AXES, and those after them for what else is drawn."""
+    """Random numbers of a part: a stream for each of AXES, and those after them for what else is drawn."""
     return np.random.default_rng([seed, LAWS.index(law), stream])
 
 

@@ -20,7 +20,7 @@ from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior
 from selfcal.model.laws import KINDS, NAMED, PARAMETERS, PLACES, Law
 from selfcal.model.regressors import channels_of, column_sources
 
-#: Most samples a bank interval: the float sums of one block lose digits with more.
+#: Most samples a bank interval: the float sums of a block lose digits with more.
 MOST_BLOCK = 1_000_000
 
 
@@ -42,7 +42,7 @@ PriorRow = tuple[float, float, PriorLaw, bool]
 
 @dataclass(frozen=True)
 class Grid:
-    """One grid dimension: `nodes` even steps; `fit` [nodes, nodes] turns node values into B-spline coefficients."""
+    """A grid dimension: `nodes` even steps; `fit` [nodes, nodes] turns node values into B-spline coefficients."""
 
     nodes: int
     fit: Array
@@ -50,7 +50,7 @@ class Grid:
 
 @functools.cache
 def make_grid(nodes: int) -> Grid:
-    """The not-a-knot spline through `nodes` points one apart (knots: `knot()` in lib/report_spline.c)."""
+    """The not-a-knot spline through `nodes` points 1 apart (knots: `knot()` in lib/report_spline.c)."""
     z = np.arange(nodes, dtype=float)
     knots = np.concatenate([np.zeros(6), np.arange(3.0, nodes - 3.0), np.full(6, nodes - 1.0)])
     return Grid(nodes, np.asarray(np.linalg.inv(_basis(z, knots, 5)), np.float64))
@@ -71,7 +71,7 @@ def _basis(z: Array, knots: Array, degree: int) -> Array:
 
 @dataclass(frozen=True)
 class AxisTable:
-    """One axis: ln limits and law of each parameter's prior (order of PARAMETERS), and the read-out."""
+    """An axis: ln limits and law of each parameter's prior (order of PARAMETERS), and the read-out."""
 
     name: str
     unit: str
@@ -85,11 +85,11 @@ class AxisTable:
 
 @dataclass(frozen=True)
 class RegressorTable:
-    """One column of the regressors; `coefficient_sd` [axes] in the axis's unit per `unit`, 0 where it has it not.
+    """A column of the regressors; `coefficient_sd` [axes] in the axis's unit per `unit`, 0 where it has it not.
 
-    `source`: kind, number and second number (`selfcal_source_t`), and the channel's name and unit, "" without one.
-    `ln_odds` [axes]: prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean` [axes]:
-    empty for 0."""
+    `source`: kind, number and second number (`selfcal_source_t`), and the channel's name and unit, "" without a
+    channel. `ln_odds` [axes]: prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean`
+    [axes]: empty for 0."""
 
     name: str
     unit: str
@@ -102,8 +102,8 @@ class RegressorTable:
 
 @dataclass(frozen=True)
 class HypothesisTable:
-    """One hypothesis: its law, prior probability and grids; of a sum or a warm start also each axis's priors in the
-    order of PARAMETERS."""
+    """A hypothesis: its law, prior probability and grids; of a sum or a warm start also each axis's priors in the order
+    of PARAMETERS."""
 
     name: str
     law: Law
@@ -120,7 +120,7 @@ class HypothesisTable:
 
 @dataclass(frozen=True)
 class GateTable:
-    """The gate for one sampling rate, its fields as the bindings take them: `window` in samples; of each axis `sigma`
+    """The gate for a sampling rate, its fields as the bindings take them: `window` in samples; of each axis `sigma`
     (infinite: left out), and if it is a gyro."""
 
     window: int
@@ -134,7 +134,7 @@ class GateTable:
 
 @dataclass(frozen=True)
 class Tables:
-    """A model for one bank interval `dt_s` = `block` samples, for some axes and one target's node counts."""
+    """A model for a bank interval `dt_s` = `block` samples, for some axes and a target's node counts."""
 
     dt_s: float
     block: int
@@ -201,7 +201,7 @@ def bank_block(rate_hz: float, bank_rate_hz: float) -> int:
 
 
 def gate_table(model: Model, tables: Tables) -> GateTable | None:
-    """The model's gate for the axes and the rate of `tables`; None if it has none, or a bank interval is one sample."""
+    """The model's gate for the axes and the rate of `tables`; None without a gate, or if `block` is 1."""
     if model.gate is None or tables.block == 1:
         return None
     gate, rate_hz = model.gate, tables.rate_hz

@@ -1,6 +1,6 @@
-"""Readings that the firmware or the logger changed as no likelihood of counts on one lattice shows it.
+"""Readings that the firmware or the logger changed as no likelihood of counts on a lattice shows it.
 
-Maps that add whole spans (a count read as unsigned, an overflow, bytes of two readings in one) are undone. A bit that
+Maps that add whole spans (a count read as unsigned, an overflow, joined bytes of two readings) are undone. A bit that
 never changes and a change of the range show in the codes themselves. codes.py has the maps of neighbouring codes.
 """
 
@@ -18,16 +18,16 @@ from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import CHANGED_LEAST, LEVEL_PIECES, PIECE_ROWS, Misread, codes_of
 from selfcal.readings.lattice import Lattice, step_of
 
-#: Share of the readings that a span has changed, or of the codes with a bit, that may be one value, or are there.
+#: Largest share of the changed readings that may be a single value; least share of the codes with a bit that occur.
 SPAN_SHARE_MOST = 0.9
-#: Deviations, in noises, from which on a reading is none of the noise. Of the torn ones, how many more lie on one side,
-#: in standard deviations.
+#: Least deviation of a reading that is not noise, in noises. Largest excess of torn readings on either side, in
+#: standard deviations.
 FAR_NOISES, EITHER_SIDE = 6.0, 4.0
 #: Quantiles of the codes of which most have the bit that is there.
 INNER = (0.01, 0.99)
 #: Bits at least of a count that goes round.
 BITS_LEAST = 5
-#: Noises of a reading in the circle of a count from which on each has its turn; with half of them a torn one shows.
+#: Least span of a count that shows each reading's turns, in noises of a reading. Half of it shows torn readings.
 CIRCLE_NOISES = 8.0
 #: What may have happened, by kind.
 MISREAD = MappingProxyType(
@@ -47,10 +47,10 @@ MISREAD = MappingProxyType(
 
 
 def spans_of(values: Array) -> Misread | None:
-    """Readings [n] to which whole spans were added; NaN are none of them. O(n) a span that is tried.
+    """Readings [n] to which whole spans were added; NaN: missing. O(n) for each span that is tried.
 
-    A count that goes round loses its turns: readings lie near a level on the circle of its codes. A torn one is off by
-    the least step of its upper part, to either side as often. On a lattice spans are its powers of two."""
+    A count that goes round loses its turns: readings lie near a level on the circle of its codes. A torn reading is off
+    by the least step of its upper part, to either side as often. On a lattice spans are its powers of two."""
     known = np.flatnonzero(np.isfinite(values))
     y = values[known]
     if y.size < PIECE_ROWS or not np.ptp(y) > 0.0:
@@ -106,7 +106,7 @@ def _of_span(y: Array, span: float, line: float, torn: bool, lattice: bool) -> M
     changed, off = turns != 0.0, straight + span * turns
     count, size, sd = int(np.count_nonzero(changed)), float(np.ptp(y)), float(off.std())
     if count < CHANGED_LEAST or np.unique(y[changed], return_counts=True)[1].max() > SPAN_SHARE_MOST * count:
-        return None  # one value is a lost word
+        return None  # a single value is a lost word
     share = count / y.size
     nats = _ln_of_noise(off, size) - max(line, _ln_of_noise(straight, size))
     if torn:
@@ -120,17 +120,17 @@ def _of_span(y: Array, span: float, line: float, torn: bool, lattice: bool) -> M
     nats = min(nats, _ln_of_noise(steps - span * np.rint(steps / span), size) - _ln_of_noise(steps, size))
     kind = "overflow" if float(y.min()) < 0.0 else "low_bits"
     middle = float(np.median(y + span * turns))
-    # The true ones are about zero, of a wide count by more of their noises.
+    # The true readings are about zero; in a wide count, within more of their noises.
     if kind == "low_bits" and min(middle, span - middle) < max(sd, span / CIRCLE_NOISES**2):
         kind, turns = "unsigned", turns - float(np.rint(middle / span))
     return Misread(kind, float(np.mean(turns != 0.0)), nats, y + span * turns if sd * CIRCLE_NOISES < span else None)
 
 
 def _of_bits(values: Array, lattice: Lattice | None) -> list[Misread]:
-    """Readings [n], NaN where there are none, whose codes lack one bit: every other 2^k of them never comes. Or that
-    lack the lowest ones until one time, or from then on: the range of the part was changed, and they are right.
+    """Readings [n] (NaN: missing) whose codes lack a bit: every other 2^k codes never come. Or whose codes lack the
+    lowest bits until a time, or from a time on: the range of the part changed, and the readings are right.
 
-    Each time that the bits above it change, the bit itself is one or the other by chance."""
+    Each time that the bits above it change, the bit itself is 0 or 1 by chance."""
     y = values[np.isfinite(values)]
     if lattice is None or y.size < LEVEL_PIECES:
         return []
@@ -152,7 +152,7 @@ def _of_bits(values: Array, lattice: Lattice | None) -> list[Misread]:
 
 
 def misread_of(values: Array, lattice: Lattice | None) -> Misread | None:
-    """How readings [n], NaN where there are none, were misread: by the likeliest map; None where they were not."""
+    """The likeliest way in which readings [n] (NaN: missing) were misread, None where they were not."""
     of_bits = _of_bits(values, lattice)
     stuck = [misread for misread in of_bits if misread.kind != "range_change"]
     codes = None if stuck else codes_of(values, lattice)

@@ -3,7 +3,7 @@
 A map says as which code each true value is read: a dead band, every other code narrow, a word in place of any reading,
 a limit, a sign or zeros that printing loses, a cast that truncates. Noise is normal about a level that each piece of
 the record has for itself. The counts of the pieces have a likelihood under each map. Readings on no lattice have cells
-for codes, and their commonest value has one of its own.
+for codes, and their commonest value has its own cell.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from selfcal.readings.lattice import COARSEST, FINE, Lattice, step_of
 
 #: Codes or cells at most, and readings at least.
 CODES, READINGS_LEAST = 400, 300
-#: Pieces of a record that have a level each, at most, and readings in one at least.
+#: Most pieces of a record that have a level each; fewest readings in a piece.
 LEVEL_PIECES, PIECE_ROWS = 100, 64
 #: Share of the readings from which on the commonest value has no part in the steps that show the noise.
 COMMON_SHARE = 0.2
-#: Cells in the noise of readings on no lattice; parts of true values in one, and points of them.
+#: Cells in the noise of readings on no lattice; parts of true values in a cell, and points in a cell.
 CELLS, CELL_PARTS, CELL_POINTS = 4.0, 8, 32
 #: Noises that are tried first, in that of differences; steps of a level, in noises.
 TRIED_NOISES, LEVEL_STEP = np.geomspace(0.1, 3.0, 12), 0.5
 #: Shares that are read as another code, and further codes of a dead band on either side.
 MISREAD_SHARES, DEAD_CODES_MOST = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 1.0, 23)]), 12
-#: Times that the commonest value of readings on no lattice is commoner than the next one.
+#: Ratio of the counts of the two commonest values above which the first stands out, on no lattice.
 STANDS_OUT = 3.0
-#: Times that a map is sought at the levels and noises of the last one, and these are refined for one map.
+#: Rounds in which a map is sought at the last map's levels and noises, or these are refined for a map.
 TURNS = 3
 #: Chance of a reading that the noise and the codes, or a map, do not make.
 ODD = 1e-6
-#: Readings that a map changes, or of a value that is one, at least.
+#: Fewest readings that a map changes, or that have a suspect value.
 CHANGED_LEAST = 5
 #: Kinds that are no cause of their own here: lost_words.py and readings.py have them.
 ELSEWHERE = ("word", "limit")
@@ -71,7 +71,7 @@ class Misread:
 
     @property
     def sd(self) -> float:
-        """Of the share of codes that are not alike."""
+        """sd of the share of codes that are not alike."""
         return 0.0 if self.undone is None else math.sqrt(2.0 * self.share / self.undone.size)
 
 
@@ -79,7 +79,7 @@ class Misread:
 class _Map:
     """`to` [codes, parts]: the chance that a true value in a part of a code is read as a code. Or `lost` [codes], the
     share of each code that is read as the code `place`, of unequal codes as its neighbours. Of a dead band `inner` is
-    the whole codes on either side, `share` what is lost of the next ones."""
+    the whole codes on either side, `share` the lost part of the next codes."""
 
     kind: str
     to: csr_matrix | None = None
@@ -89,7 +89,7 @@ class _Map:
     share: float = 1.0
 
     def read(self, expected: Array) -> Array:
-        """Readings [codes, ...] of `expected` true ones [codes, ...]."""
+        """Counts read [codes, ...] of `expected` true counts [codes, ...]."""
         assert self.lost is not None
         moved = (self.lost * expected.T).T
         read = np.asarray(expected - moved)
@@ -107,8 +107,8 @@ class _Map:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Level, noise and ln likelihood of each piece, [2, pieces]: with one noise for all, and with one for each, which
-    has its price."""
+    """Level, noise and ln likelihood of each piece, [2, pieces]: with a noise for all pieces, and with a noise for each
+    piece at a price."""
 
     level: Array
     sigma: Array
@@ -133,7 +133,7 @@ class Cells:
     def __init__(self, y: Array, step: float) -> None:
         commonest, most, self.noise = noise_beside(y)
         self.pile = None
-        if not step > 0.0 and most >= CHANGED_LEAST:  # it may lie beside the lattice of the others
+        if not step > 0.0 and most >= CHANGED_LEAST:  # it may lie off the lattice of the others
             others = y[y != commonest]
             step = step_of(others)[0]
             beside = step > FINE * self.noise or most > STANDS_OUT * np.unique(others, return_counts=True)[1].max(
@@ -151,7 +151,7 @@ class Cells:
         # A code has an upper and a lower half: that is enough for a cast.
         self.parts = 2 if self.width < 1.5 * self.step else CELL_PARTS
         code = np.rint((y - self.origin) / self.width).astype(np.int64)
-        middle = int(np.quantile(code, 0.5, method="lower"))  # one of them: a mean of two may lie far from all
+        middle = int(np.quantile(code, 0.5, method="lower"))  # a code that occurs: a mean of two may lie far from all
         self.kept = np.abs(code - middle) < CODES // self.parts
         code = code[self.kept]
         low, high = int(code.min()), int(code.max())
@@ -186,7 +186,7 @@ class Cells:
 
     @cached_property
     def true(self) -> list[tuple[Array, Array]]:
-        """Of each noise the levels, and the chance [parts, levels] of parts of codes."""
+        """The levels for each noise, and the chance [parts, levels] of parts of codes."""
         chances = []
         # The mean of a piece is within two noises of its level, unless the readings are folded.
         mean = self.count @ (self.origin + self.width * np.append(np.arange(self.many - 1) + self.first, 0))
@@ -242,7 +242,7 @@ class Cells:
         return np.asarray(self.of_pieces(fit) @ self.count.sum(axis=1))
 
     def gain(self, rival: _Map, expected: Array) -> float:
-        """Of ln likelihood of the counts of all pieces together by a map, over those `expected` [codes] without it."""
+        """Gain of a map in ln likelihood of the counts of all pieces, over the counts `expected` [codes] without it."""
         floor = ODD * float(self.total.sum()) / self.many
         return float(self.total @ np.log((rival.read(expected) + floor) / (expected + floor)))
 
@@ -296,7 +296,7 @@ def _about_zero(cells: Cells, y: Array) -> Iterator[_Map]:
 
 
 def _of_places(cells: Cells, over: Array, near: _Map | None = None) -> Iterator[_Map]:
-    """Dead bands, words and unequal codes, about the codes that are read too often, or those next to one. `over`:
+    """Dead bands, words and unequal codes, about the codes that are read too often, or close to the map `near`. `over`:
     readings [codes] that are expected without them."""
     code, n = np.arange(cells.many), float(cells.total.sum())
     kinds = {"band", "word", "uneven"} if near is None else {near.kind}
@@ -324,8 +324,8 @@ def _of_places(cells: Cells, over: Array, near: _Map | None = None) -> Iterator[
 
 
 def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
-    """The map of readings [n], NaN where there is none, that explains their codes best; None where all are read alike,
-    or their counts show nothing: on a lattice that is coarse beside the noise, or too few of them."""
+    """The map of readings [n] (NaN: missing) that explains their codes best; None where all are read alike, or their
+    counts show nothing: on a lattice that is coarse against the noise, or in too few readings."""
     known = np.flatnonzero(np.isfinite(values))
     y = values[known]
     if y.size < READINGS_LEAST or (not noise_beside(y)[2] > 0.0 if lattice is None else lattice.too_coarse):
@@ -363,7 +363,7 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
     if best.kind in UNEVEN:
         undone = values.copy()
         undone[known[cells.kept]] = _drawn(cells, y[cells.kept], to, fit)
-    if best.kind == "word":  # one of the values of a code
+    if best.kind == "word":  # the word is a single value of its code
         chance = np.asarray(cells.own[best.place] @ cells.of_pieces(fit)).ravel() * max(cells.step / cells.width, 0.01)
         random = np.random.default_rng(1).random(cells.code.size)
         lost = random * (best.share + (1.0 - best.share) * chance[cells.piece]) < best.share
@@ -378,7 +378,7 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
 
 
 def _drawn(cells: Cells, y: Array, to: csr_matrix, fit: _Fit) -> Array:
-    """Each reading [n] as one that it may come from, drawn by chance."""
+    """Draw for each reading [n] a true reading that it may come from."""
     random, chance, drawn = np.random.default_rng(1), cells.of_pieces(fit), y.copy()
     other = to - to.multiply(cells.own > 0.0)
     own = cells.own.argmax(axis=0).A1 + cells.first

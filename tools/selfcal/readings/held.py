@@ -1,8 +1,8 @@
 """Readings that a logger asks for oftener than the part measures: each repeats until the next one.
 
 Asked twice as often and more, most rows repeat: the runs of equal rows show the part. Asked less often, a row repeats
-only now and then: at the beat of the two rates. The phase of that beat tells the repeats from readings that are equal
-by chance. Where the rows come at random the beat is lost. Repeats on a fine lattice are no chance even then.
+only now and then: at the beat of the two rates. The phase of that beat separates the repeats from readings that are
+equal by chance. Where the rows come at random the beat is lost. Repeats on a fine lattice are no chance even then.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from selfcal.readings.budget import nats_of
 SHARE_LEAST = 0.008
 #: Rows that show its line, and the power of the line over the mean in the blocks that follow its phase.
 LINE_ROWS, IN_BLOCK = 1 << 17, 60.0
-#: Share of the rows that repeat, over the beat's frequency, at least: one a beat, and one more for each late row.
+#: Least share of rows that repeat, over the beat's frequency: a row a beat, and a row more for each late row.
 ONE_EACH = 0.75
-#: Share of the rows in whose phase none repeats, at least, and of the repeats that those phases have, at most.
+#: Least share of the rows at phases without repeats; largest share of the repeats at those phases.
 SMEARED, REPEATS_LEFT_MOST = 0.25, 0.35
 #: Share of readings that are equal by chance from which on a row may be; rows that repeat at no beat, at most.
 EQUAL_SHARE, RUN_MOST = 0.01, 5
@@ -57,7 +57,7 @@ def held_of(columns: Sequence[Array], places: Rows, off: Array | None) -> Held |
     """
 
     def equal(lag: int) -> Mask:
-        """Whether a row repeats the one so many before, [n]."""
+        """Whether each row [n] repeats the row `lag` before."""
         of_part = np.zeros(places.size, bool)
         of_part[lag:] = np.logical_and.reduce([column[lag:] == column[:-lag] for column in columns])
         return of_part
@@ -82,10 +82,10 @@ class Slower:
 
 
 def slower_stretches(values: Array) -> list[Slower]:
-    """Stretches of readings [n], NaN where there is none, in which the part or the logger ran at a part of its rate.
+    """Stretches of readings [n] (NaN: missing) in which the part or the logger ran at a part of its rate.
 
-    In a stretch every row but each `ratio`th repeats. A repeat counts by its chance: the share of the readings that
-    equal one two to four rows before, or of the stretch's own where more of these are equal.
+    In a stretch every row but each `ratio`th repeats. A repeat counts by its chance. That is the share of readings
+    equal to a reading two to four rows before, or of equal new readings in the stretch if larger.
     """
     n = values.size
     if n < 4 * RATIO_MOST:
@@ -113,19 +113,20 @@ def repeats_of(stretches: Sequence[Slower], n: int) -> Mask:
 
 
 def equal_by_chance(values: Array) -> float:
-    """Share of readings [n] that equal one two to four before: by chance alone, on a lattice of several steps too."""
+    """Share of readings [n] equal to a reading 2 to 4 rows before: by chance alone, on a lattice of several steps
+    too."""
     return sum(float(np.count_nonzero(values[k:] == values[:-k])) for k in (2, 3, 4)) / (3.0 * values.size)
 
 
 def _slower(same: Mask, ratio: int, chance: float) -> Slower:
-    """The likeliest stretch of rows [n] that repeat the one before, but for every `ratio`th row."""
+    """The likeliest stretch of rows [n] that repeat the row before, but for every `ratio`th row."""
     n, best = same.size, Slower(ratio, np.zeros(0, np.int64), 0.0)
     more, less = math.log((1.0 - MISSED) / chance), math.log(MISSED / (1.0 - chance))
     paid = 2.0 * math.log(n) + math.log(RATIO_MOST**2)
     places = np.ascontiguousarray(same[: n - n % ratio].reshape(-1, ratio).T).view(np.int8)
     repeats = places.sum(axis=0, dtype=np.int8)
     of_group = less * (ratio - 1) + (more - less) * np.arange(ratio)
-    # By whole groups of rows first: a stretch holds two parts of one more at most.
+    # Whole groups of rows first: a stretch has at most two parts of groups more.
     price = paid - 2.0 * (ratio - 1) * more
     if _best_sum(of_group[np.minimum(repeats, ratio - 1)])[0] <= price:
         return best
@@ -146,7 +147,7 @@ def _slower(same: Mask, ratio: int, chance: float) -> Slower:
 
 
 def _best_sum(worth: Array) -> tuple[float, int, int]:
-    """The largest sum of neighbours, and the places of its first one and after its last."""
+    """The largest sum of neighbours, the place of its first term, and the place after its last."""
     total = np.concatenate([[0.0], np.cumsum(worth)])
     gain = total - np.minimum.accumulate(total)
     end = int(np.argmax(gain))
@@ -155,9 +156,9 @@ def _best_sum(worth: Array) -> tuple[float, int, int]:
 
 def updates(values: Array, places: Rows) -> Rows | None:
     """Rows at which a channel [n] is read anew, where its value is held in between or bridged by straight lines; None
-    where no one period shows. `places` [n]: places of the rows on the logger's grid.
+    where no single period shows. `places` [n]: places of the rows on the logger's grid.
 
-    A new value may equal the last one, so all changes lie whole periods apart. Chance would spread them evenly."""
+    A new value may equal the last value, so all changes lie whole periods apart. Chance would spread them evenly."""
     steps = np.diff(values)
     bends = np.abs(np.diff(steps)) > 1e-9 * float(np.ptp(values))
     held_rows = np.flatnonzero(steps) + 1
@@ -179,8 +180,8 @@ def updates(values: Array, places: Rows) -> Rows | None:
 
 
 def _in_runs(same: Mask, places: Rows) -> Held | None:
-    """Readings that repeat by chance make runs of any length, most of them of one. The runs of held ones are whole
-    multiples of one length, those of several lengths of as many readings that are equal by chance."""
+    """Runs of readings that repeat by chance have any length, mostly 1. Runs of held readings are whole multiples of a
+    length: a run of m lengths has m readings that are equal by chance."""
     starts = np.flatnonzero(~same)
     lengths = np.diff(starts, append=same.size)
     nats, ratio = rhythm(lengths[1:-1])
@@ -195,7 +196,7 @@ def _in_runs(same: Mask, places: Rows) -> Held | None:
 
 
 def _at_a_beat(same: Mask, again: Mask, places: Rows, off: Array | None) -> Held | None:
-    """Rows that repeat the one before at the beat of two rates. `again` [n]: a row equals the one two before, which a
+    """Rows that repeat the row before at the beat of two rates. `again` [n]: a row equals the row two before, which a
     held reading does by chance alone."""
     n = same.size
     next_one = np.diff(places, prepend=places[0] - 2) == 1
@@ -254,8 +255,8 @@ def _at_a_beat(same: Mask, again: Mask, places: Rows, off: Array | None) -> Held
 
 
 def _now_and_then(same: Mask, again: Mask, places: Rows) -> Held | None:
-    """Rows that repeat the one before at no beat, where readings are hardly ever equal by chance. A run of more than
-    RUN_MOST is a stuck one."""
+    """Rows that repeat the row before at no beat, where readings are hardly ever equal by chance. A run of more than
+    RUN_MOST is stuck."""
     n = same.size
     starts = np.flatnonzero(~same)
     lengths = np.diff(starts, append=n)

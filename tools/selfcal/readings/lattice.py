@@ -13,29 +13,29 @@ from numpy.typing import NDArray
 #: lattice. A reading that toggles between two values has at least 2, however little noise there was before rounding.
 #: At 1.9 that noise is 0.44 steps and N a fifth too large; below, rounding is white noise of step^2 / 12.
 COARSE_FROM = 1.9
-#: Sums that show whether rounding errors are carried on, of a second and of so many readings at least: they scatter by
-#: less than this share of what rounding by itself makes of them. That takes a lattice coarser than COARSEST.
+#: Fewest sums, over 1 s each, that show carried rounding errors, and fewest readings in a sum. Such sums scatter by
+#: less than this share of sums of independent readings. That takes a lattice coarser than COARSEST.
 CARRIED_SUMS, CARRIED_READINGS, CARRIED_SHARE = 120, 8, 0.5
 #: Difference of two remainders of sums that follow each other, each uniform in a step: its share in the scatter.
 REMAINDERS = 0.25
-#: Least variance that is told of a counter, steps^2 in a second: what 120 seconds show is as uncertain as 0.04.
+#: Least variance in `carried` of a counter, steps^2 in a second: 120 seconds show it to 0.04 only.
 CARRIED_LEAST = 1e-3
 #: Variance, in steps^2, that noise gains in an interval from which on the remainders of its ends are white: they
 #: correlate by exp(-2 pi^2 of it), 0.14.
 WHITE_REMAINDERS = 0.1
-#: Values nearer than this share of the largest are one: differences of a counter are rounded so. Those of a float32 are
-#: six times as far apart.
+#: Values nearer than this share of the largest are equal: differences of a counter are rounded so. Values of a float32
+#: are six times as far apart.
 SAME_VALUE_SHARE = 1e-8
 #: Steps in the noise of a reading from which on the lattice is coarser than it. Codes are compared below alone: beyond,
 #: heavy tails look like a dead band, and ln of the counts is not smooth.
 COARSEST = 1.0
 #: Below this many steps in the noise the lattice is that of the number's digits, and shows in nothing.
 FINE = 0.01
-#: Largest distance of a value from its lattice, in steps; largest difference of two steps that are one, over one.
+#: Largest distance of a value from its lattice, in steps; largest relative difference of two equal steps.
 OFF = 0.02
 #: Last digits of printed values in a step at least, for it to show.
 PRINTED = 3.0
-#: Differences between neighbouring values from which on the values of one decade, or of one octave, show their step.
+#: Differences between neighbouring values from which on the values of a decade, or of an octave, show their step.
 STEP_DIFFERENCES_LEAST = 20
 
 
@@ -53,12 +53,12 @@ class Lattice:
 
     @property
     def most(self) -> float:
-        """Coarseness beyond which the noise is below the lattice. Of a counter it is: else no remainder would show."""
+        """Coarseness beyond which the noise is below the lattice. A counter's is: else no remainder would show."""
         return COARSEST if self.carried else COARSE_FROM
 
     @property
     def too_coarse(self) -> bool:
-        """Rounding is no white noise: the noise cannot be told from the lattice."""
+        """Rounding is no white noise: the noise cannot be separated from the lattice."""
         return self.coarseness > self.most
 
     @property
@@ -69,7 +69,7 @@ class Lattice:
         return math.floor(rate / digit) * digit
 
     def too_coarse_over(self, interval_s: float) -> bool:
-        """The same of means over an interval. Those of a counter have white remainders (quantization noise)."""
+        """Whether means are too coarse. Long means of a counter have white remainders (quantization noise)."""
         return self.too_coarse and self.carried * interval_s < WHITE_REMAINDERS
 
 
@@ -106,23 +106,23 @@ def step_of(values: NDArray[np.floating[Any]]) -> tuple[float, int]:
 
 
 def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
-    """Whether values of every size have this step. A printed number of so many digits has a coarser one from each power
-    of ten on, a binary one from each power of two on."""
+    """Whether values of every size have this step. A printed number with a fixed count of digits has a coarser step
+    from each power of ten on, a binary number from each power of two on."""
     size = np.abs(unique)
     for base in (2.0, 10.0):
         with np.errstate(divide="ignore"):
             kind = np.floor(np.log(size) / math.log(base))
         for decade in np.unique(kind[np.isfinite(kind)]):
             for part in (unique[(kind == decade) & (unique > 0.0)], unique[(kind == decade) & (unique < 0.0)]):
-                some = part.size > STEP_DIFFERENCES_LEAST and np.ptp(part) > 0.5 * step  # else one value, rounded
+                some = part.size > STEP_DIFFERENCES_LEAST and np.ptp(part) > 0.5 * step  # else a single value, rounded
                 if some and not abs(_step(part) / step - 1.0) < OFF:
                     return False
     return True
 
 
 def _step(unique: NDArray[np.floating[Any]]) -> float:
-    """The spacing of the lattice that all values lie on, 0 if there is none: the smallest difference between values,
-    where every difference is a whole multiple of it; or to the last digit of values that are printed with few."""
+    """The spacing of the lattice that all values lie on, else 0. It is about the smallest difference between values.
+    Every difference is a whole multiple of it, to the last digit of values printed with few."""
     gaps = np.diff(unique)
     gaps = gaps[gaps > SAME_VALUE_SHARE * np.abs(unique).max(initial=0.0)]
     if not gaps.size:

@@ -1,6 +1,6 @@
-"""Readings that are one value more often than their noise and lattice explain: words that a bus has lost.
+"""Readings that have a value more often than their noise and lattice explain: words that a bus has lost.
 
-Far from the rest such a value needs no statistic of the noise. Within the noise the likelihood of the codes finds it.
+A value far from the rest needs no statistic of the noise. Within the noise the likelihood of the codes finds it.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ CLOSE, CLOSE_OWN, CLOSE_OTHERS = 0.5, 0.5, 0.05
 
 @dataclass(frozen=True)
 class Recurring:
-    """Readings that are one `value` too often: their `share`, the `mask` [n] of those to leave out, and the evidence in
-    nats. Beyond a share of WRONG_SHARE_MOST none is left out."""
+    """Readings that have a `value` too often: their `share`, the `mask` [n] of readings to leave out, and the evidence
+    in nats. Beyond a share of WRONG_SHARE_MOST the mask is empty."""
 
     value: float
     share: float
@@ -40,8 +40,8 @@ class Recurring:
 
 
 def recurring_of(values: Array, explained: Misread | None) -> Recurring | None:
-    """The value that recurs most surely in readings [n], NaN where there is none: one with hardly another reading near
-    it, or the word that the likelihood of the codes found, if `explained` by one."""
+    """The value that recurs most surely in readings [n] (NaN: missing). It is a value with hardly another reading near
+    it, or the word that the likelihood of the codes `explained`."""
     known = np.isfinite(values)
     y = values if known.all() else values[known]
     if y.size < 8 * AROUND:
@@ -83,7 +83,7 @@ def _alone(y: Array, sigma: float, spacing: float) -> tuple[float, float]:
 
 
 def _stands_out(y: Array, value: float, spacing: float) -> bool:
-    """Whether more readings [n] are of a value than the cubic through ln of the counts beside it has."""
+    """Whether more readings [n] have a value than the cubic through ln of the neighbouring counts predicts."""
     code = np.rint((y - value) / spacing)
     count = np.array([np.count_nonzero(code == k) + 0.5 for k in (-2, -1, 1, 2)])
     weight = np.array([-1.0, 4.0, 4.0, -1.0]) / 6.0
@@ -93,7 +93,7 @@ def _stands_out(y: Array, value: float, spacing: float) -> bool:
 
 
 def _rests(y: Array, own: Mask, sigma: float) -> bool:
-    """Whether most of the own ones among readings [n] lie among others that rest, as many on either side."""
+    """Whether most of the `own` readings among [n] lie among others that rest, as many on either side."""
     others, rows = np.flatnonzero(~own), np.flatnonzero(own)
     rows = rows[:: -(-rows.size // SAMPLED)]
     first = np.clip(np.searchsorted(others, rows) - AROUND, 0, others.size - 2 * AROUND)

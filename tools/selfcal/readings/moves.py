@@ -1,12 +1,12 @@
-"""A sensor that moves, in the raw readings and before any fit: its energy against that of the time about it.
+"""A sensor that moves, in the raw readings and before any fit: its energy against the energy before and after.
 
-Energy is that of second differences of the readings and of short means, about a running median: ramps and jumps have
-none. A window is compared with its louder side, at its own length. So noise that grows, breathes or stays loud is no
-motion. At rest the mean of n squares exceeds r times its expectation with a probability below
-exp(-n (r - 1 - ln r) / 2) (Chernoff). Axes are independent at rest: the sensor moves where some but the loudest are
-louder together, or where one is so loud that no other window of its record is. A hand that pushes shows in the level:
-how far it is from a long running median, beyond any noise. At an end of the record one side is missing and noise may
-have grown: an axis alone moves there where most of its readings are pushed.
+Energy is that of the readings and of short means about their running median: ramps and jumps have little. A window is
+compared with its louder side, at its own length. So noise that grows, breathes or stays loud is no motion. At rest the
+mean of n squares exceeds r times its expectation with a probability below exp(-n (r - 1 - ln r) / 2) (Chernoff). Axes
+are independent at rest. The sensor moves where axes without the loudest are louder together, or where an axis is as
+loud as in no other window of its record. A hand that pushes shows in the level: how far it is from a long running
+median, beyond any noise. At an end of the record one side is missing and noise may have grown: an axis alone moves
+there where most of its readings are pushed.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ Time = TypeVar("Time", int, float)
 
 #: Length of a piece, s, and pieces at most.
 ENERGY_PIECE_S, PIECES_MOST = 0.1, 40_000
-#: Lengths of the means whose energy is taken beside the readings', s: a knock is short, and a hand that turns slowly
-#: shows in long ones alone. Pushes are looked for in the shortest ones. Readings in one at least.
+#: Lengths of the means whose energy is taken besides the readings', s: a knock is short, and a hand that turns slowly
+#: shows in long means alone. Pushes are looked for in the shortest means. Fewest readings in a mean.
 BANDS_S, BAND_LEAST = (0.1, 0.5), 5
 #: Standard deviations of the median about a wild reading at most, and of itself at least.
 WILD_SDS = (3.0, 8.0)
-#: Readings whose median is the level of the middle one: ramps, jumps and slow waves have no part in what is apart from
-#: it. Squares of white noise about it in one degree of freedom.
+#: Readings whose median is the level of the middle reading: ramps, jumps and slow waves have no part in what is apart
+#: from it. Squares of white noise about it in one degree of freedom.
 LEVEL, SQUARES = 9, 1.29
-#: Longest window, s. Its sides are so many times as long each, PUSH_S at least, and squares at least.
+#: Longest window, s. Length of each side, in windows (PUSH_S at least), and fewest squares in a side.
 WINDOW_S, SIDE_WINDOWS, SIDE_SQUARES = 32.0, 8, 120
-#: Probability, a record, that axes at rest move together, and that one moves alone.
+#: Probability, for a record at rest, that axes seem to move together, and that an axis seems to move alone.
 P_MOVE = SHARES["motion"]
-#: Share of an axis' windows that are its usual loudness. The rest is the most that may be loud on one axis alone.
+#: Share of an axis' windows with its usual loudness. At most the rest may be loud on an axis alone.
 USUAL_SHARE = 0.9
-#: Quantiles of the means of windows that show their spread without the loud ones: the median, and one sd below it.
+#: Quantiles of the means of windows that show their spread without the loud windows: the median, and 1 sd below it.
 QUIETER = (0.1587, 0.5)
 #: Discount, nats, of the joint search over windows against independent windows: of 124 clean records of 600 and 1500 s
 #: at 1 and 10 Hz the largest evidence is 1.5 to 1.9 less in the median, and 2.0 to 2.7 in a tenth.
@@ -55,17 +55,17 @@ SHARED = 0.05
 CORRELATED, COPY = 5.0, 0.999
 #: Usual deviations from which on a deviation from the level is a push, and seconds whose running median is that level.
 PUSH, PUSH_S = 8.0, 10.0
-#: The noise beside a window is at least this share of the record's own: a still stretch makes no other one loud.
+#: Least noise around a window, as a share of the record's own: a still stretch makes no other stretch loud.
 STILL = 0.5
-#: A stretch begins and ends so much beyond its pieces, s. This close to an end of the record it reaches it, s.
+#: Margin of a stretch beyond its pieces, s. Distance to an end of the record that a stretch bridges, s.
 MARGIN_S, EDGE_S = 0.5, 5.0
 
 
 @dataclass(frozen=True)
 class Moved:
     """Motion of one axis: begin and end of its stretches in order, s, their `nats` over rest, and those `net` of the
-    search. `ratio`: the readings in them about their level over the noise beside them, root mean square; not a number
-    where that is 0. `events`: the same of each event that the axis is in."""
+    search. `ratio`: the readings in them about their level over the noise around them, root mean square; NaN where the
+    noise is 0. `events`: the same of each event that the axis is in."""
 
     intervals: tuple[tuple[float, float], ...]
     nats: float
@@ -88,7 +88,7 @@ class Energy:
     most: Array
 
     def before(self) -> tuple[Array, ...]:
-        """Sums, counts and squares of all pieces before each one, and of all, [..., pieces + 1]."""
+        """Sums, counts and squares of all pieces before each piece, and of all pieces, [..., pieces + 1]."""
         every = (self.sums, self.counts, self.squares)
         return tuple(np.concatenate((0.0 * each[..., :1], np.cumsum(each, axis=-1)), axis=-1) for each in every)
 
@@ -223,8 +223,8 @@ def _scaled(y: Array, size: int = LEVEL) -> Array:
 
 
 def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> list[Array]:
-    """Readings of axes, [n] each, that are independent at rest: those of one clock that correlate in the nearest units
-    that do not. Of a copy nothing is left. `scaled`: about their level over their noise."""
+    """Readings of axes, [n] each, that are independent at rest: axes of a clock that correlate, in the nearest units
+    without correlation. A copy becomes 0. `scaled`: about their level over their noise."""
     free = list(rows)
     for size in {axis.size for axis in scaled} - {0}:
         own = [k for k, axis in enumerate(scaled) if axis.size == size]
@@ -271,8 +271,8 @@ def _tame(y: Array, size: int = LEVEL) -> tuple[Array, float]:
 
 
 def stretches(energy: Energy) -> list[Stretch]:
-    """The stretches in which the sensor moves. Those that are found no longer hide others beside them: their energy
-    is taken out."""
+    """The stretches in which the sensor moves. The energy of found stretches is taken out, so they hide no others near
+    them."""
     known: list[Stretch] = []
     while more := _loud_windows(energy, known):
         margin = math.ceil(MARGIN_S / energy.piece_s)
@@ -327,15 +327,15 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     for several in (True, False):
         weak = (each.net for each in [*known, *apart] if each.several == several and each.net <= sure)
         nets = sorted(weak, reverse=True)
-        # At rest exp(-net) stretches are beyond a net: the fewest that are together no chance. Those of one axis depend
-        # on each other, as its noise is not normal: for them by Simes' bound.
+        # At rest exp(-net) stretches are beyond a net: the fewest that are together no chance. Stretches of an axis
+        # depend on each other, as its noise is not normal: for these by Simes' bound.
         chances = (gammainc(k, math.exp(-net)) if several else math.exp(-net) / k for k, net in enumerate(nets, 1))
         least[several] = max((net for net, chance in zip(nets, chances, strict=True) if chance < P_MOVE), default=sure)
     return [each for each in apart if each.net >= least[each.several]]
 
 
 def _nats(energy: Energy, before: Sequence[Array], begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
-    """Nats of windows of a length over their louder side [axes, and the others but the loudest as one, bands, windows].
+    """Nats of windows of a length over their louder side [axes, and all but the loudest together, bands, windows].
     Whether an axis has both sides, or is pushed most of the time [axes, windows]. How much wider than of white noise
     the means lie, `wide` at least [axes, bands]. `before`: of the energy."""
     axes, bands, pieces = energy.sums.shape
@@ -343,7 +343,7 @@ def _nats(energy: Energy, before: Sequence[Array], begin: Rows, length: int, wid
     side = max(SIDE_WINDOWS * length, round(PUSH_S / energy.piece_s), math.ceil(SIDE_SQUARES / most))
     nats, wide = np.zeros((axes + 1, bands, begin.size)), wide.copy()
     inside = np.zeros((axes, begin.size), bool)
-    for band in range(bands):  # one by one: a long record has many windows
+    for band in range(bands):  # a band at a time: a long record has many windows
         nats[:, band], both, wide[:, band] = _of_band(energy, before, band, begin, length, side, wide[:, band])
         inside |= both
     return nats, inside, wide
@@ -352,7 +352,7 @@ def _nats(energy: Energy, before: Sequence[Array], begin: Rows, length: int, wid
 def _of_band(
     energy: Energy, before: Sequence[Array], band: int, begin: Rows, length: int, side: int, wide: Array
 ) -> tuple[Array, Mask, Array]:
-    """What `_nats` has of a band, with sides of so many pieces: [axes + 1, windows], [axes, windows], [axes]."""
+    """`_nats` of a band, with sides of `side` pieces: [axes + 1, windows], [axes, windows], [axes]."""
     sums, counts = (every[:, band] for every in before[:2])
     pieces, pushes = energy.sums.shape[2], band == energy.sums.shape[1] - 1
 
@@ -375,7 +375,7 @@ def _of_band(
     wide = np.maximum(wide, [_spread(*row) for row in zip(own, n, known, strict=True)])
     free = known / (SQUARES * wide[:, None])
     if pushes:
-        # Pushes are rare and large, also in noise that has grown: their own spread beside the window counts.
+        # Pushes are rare and large, also in noise that has grown: their own spread around the window counts.
         second, fourth, many = (
             inside(every, begin - 1 - side, begin - 1) + inside(every, begin + length + 1, begin + length + 1 + side)
             for every in (sums, before[2], counts)
@@ -385,7 +385,7 @@ def _of_band(
     ratio = np.where(known, own / np.maximum(level, STILL**2), 1.0)
     louder = np.maximum(ratio, 1.0)
     order = np.argsort(-own_free * (louder - 1.0 - np.log(louder)), axis=0)[1:]
-    # But the loudest: the next one, the next two, and so on, as many as show most. A choice costs its number of ways.
+    # Without the loudest axis: the next one, two and so on, as many as show most. A choice costs its number of ways.
     of_others = [np.take_along_axis(each, order, 0).cumsum(axis=0) for each in (ratio * own_free, own_free, side_free)]
     ratio = np.maximum(np.concatenate([ratio, of_others[0] / np.maximum(of_others[1], 0.5)]), 1.0)
     own_free, side_free = (np.concatenate(pair) for pair in ((own_free, of_others[1]), (side_free, of_others[2])))
@@ -393,7 +393,7 @@ def _of_band(
     near = nats > 1.0
     nats[near] = -np.log(np.maximum(fdtrc(own_free[near], side_free[near], ratio[near]), TINY))
     if pushes:
-        # Of readings that are far by themselves some come together: so many are rare by their share of the record.
+        # Some readings that are far by themselves come together: a number that is rare by their share of the record.
         most = energy.most[:, None]
         share = np.exp(-0.5 * most) + sums[:, -1:] / (most * np.maximum(counts[:, -1:], 1.0))
         far, usual = own * n / most, n * share
@@ -406,7 +406,7 @@ def _of_band(
 
 
 def _spread(means: Array, counts: Array, known: Mask) -> float:
-    """Times that the means of counts of squares [windows] lie wider than of white noise, by the quieter ones."""
+    """Variance of the means of `counts` squares [windows] over white noise's, by the quieter windows."""
     if np.count_nonzero(known) < SIDE_SQUARES:
         return 1.0
     low, middle = np.quantile(means[known], QUIETER)
@@ -433,7 +433,7 @@ def _sharing(energy: Energy, begin: int, end: int, axes: Mask) -> Mask:
 
 
 def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:
-    """The likeliest ends of a loud window: no part beyond them is worth its quiet beside it."""
+    """The likeliest ends of a loud window: no part beyond them is worth the quiet before it."""
     ratio, level = _ratio(energy, begin, end)
     r = ratio[axes][..., None]
     own = energy.sums[axes] / level[axes][..., None] * (1.0 - 1.0 / r) - energy.counts[axes] * np.log(r)
@@ -451,8 +451,8 @@ def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:
 
 
 def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
-    """Whether the axes that moved share a source at rest, each with another one, and it alone is loud where they moved.
-    It is the direction in which they are loudest, in units of the axes' joint noise at rest."""
+    """Whether each axis that moved shares a source with another at rest, and the source alone is loud where they moved.
+    The source is the direction in which they are loudest, in units of their joint noise at rest."""
     axes = np.flatnonzero(np.any([stretch.axes for stretch in moved], axis=0))
     parts = [energy.apart(k) for k in axes.tolist()]
     if len({piece.size for _, piece in parts}) > 1:
@@ -476,8 +476,8 @@ def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
 def motion_events(
     intervals: Mapping[str, Sequence[tuple[float, float]]],
 ) -> dict[tuple[str, ...], list[tuple[float, float]]]:
-    """Events by their axes, of the intervals of each axis: those that meet are one, and those of the same axes are one
-    again."""
+    """Events by their axes, of the intervals of each axis: intervals that meet make an event. Events of the same axes
+    stand in a list."""
     events: dict[tuple[str, ...], list[tuple[float, float]]] = {}
     for each in joined_intervals([each for own in intervals.values() for each in own]):
         names = tuple(name for name, own in intervals.items() if _overlap(own, *each))
@@ -490,7 +490,7 @@ def _overlap(intervals: Sequence[tuple[float, float]], begin: float, end: float)
 
 
 def joined_intervals(intervals: Sequence[tuple[Time, Time]]) -> list[tuple[Time, Time]]:
-    """In order of time, those that touch made one."""
+    """Intervals in order of time, merged where they touch."""
     spans: list[tuple[Time, Time]] = []
     for a, b in sorted(intervals):
         if spans and a <= spans[-1][1]:

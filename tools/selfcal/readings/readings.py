@@ -1,6 +1,6 @@
-"""What the readings of a recording show by themselves: changes of rate, motion, held, stuck and clipped ones.
+"""What the readings of a recording show by themselves: changes of rate, motion, and held, stuck and clipped readings.
 
-None of it needs a fit. `identify` and `diagnose` look at it once, at the recording's own rate, whatever they average.
+Nothing here needs a fit. `identify` and `diagnose` look once, at the recording's own rate, whatever they average.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ KEPT_MOST = 1 << 22
 COMMON_S, COMMON_OFF = 1.0, 3e-3
 #: ln of the probability, a record, of a run of equal readings that is no chance.
 LN_STUCK = -nats_of("stuck")
-#: Nats of the runs that are counted; times that there are as many as chance makes, at least. Beyond so many steps in
-#: the noise chance is not well known.
+#: Largest nats at which runs are counted; ratio of their number to chance's from which on they are held. Steps in the
+#: noise beyond which chance is not well known.
 HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 1.5, 0.8
-#: Share of an unclipped reading's information below which a clipped one is ignored.
+#: Share of an unclipped reading's information below which a clipped reading is ignored.
 CLIPPED_SHARE_LEAST = 0.05
 #: Share of the variance of an axis' steps that its copy of another leaves at most: that of a float's digits; and that
 #: of rounding to a lattice, over the variance of as many even steps.
@@ -65,7 +65,7 @@ class Clipped:
         return max(self.limits, key=lambda limit: int(self.limits[limit].sum()))
 
 
-#: A model file has a range to six digits: readings at the limit that it states may lie so much beyond.
+#: Share of the range by which readings at its limit may lie beyond it: a model file has six digits.
 RANGE_ROUNDED = 1e-5
 #: Share of readings beyond the range from which on they count as clipped, and noises to the range at most: the noise of
 #: the others is too small.
@@ -75,9 +75,9 @@ BEYOND_MOST, BEYOND_SD = 0.01, 8.0
 @dataclass(frozen=True)
 class Readings:
     """The readings of one axis: `values` [n] in the group's unit as read, NaN where they are `stuck` or `recurring`.
-    `working` [n] are those to average: NaN where the sensor is `moving` [n], and clipped ones give their information to
-    others (see `_unclipped`). In `drawn` [n] a clipped one is drawn by chance beyond its limit. `kept_out` counts the
-    stuck, the recurring and the clipped ones; repeats in stretches that are `slower` are stuck.
+    `working` [n] are those to average: NaN where the sensor is `moving` [n], and clipped readings give their
+    information to others (see `_unclipped`). In `drawn` [n] a clipped reading is drawn by chance beyond its limit.
+    `kept_out` counts the stuck, recurring and clipped readings; repeats in stretches that are `slower` are stuck.
 
     `recording`: of the part's own readings, [n] rows, where the logger `held` each.
     """
@@ -101,13 +101,13 @@ class Readings:
     slower: tuple[Slower, ...] = ()
 
     def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
-        """Samples of an engine that are not used, by reason, with the readings that are none or that are clipped."""
+        """Samples that an engine does not use, by reason, with the readings in `kept_out`."""
         counts = {**self.kept_out, **{key: count + self.kept_out.get(key, 0) for key, count in kept_out.items()}}
         return {**counts, "not_finite": counts["not_finite"] - int((~np.isfinite(self.working)).sum())}
 
     @property
     def coarse(self) -> float:
-        """Spacing of float32 at the largest reading, in the noise of one."""
+        """Spacing of float32 at the largest reading, in noises of a reading."""
         values = self.working[np.isfinite(self.working)]
         with np.errstate(over="ignore"):
             largest = np.float32(np.abs(values).max(initial=0.0))
@@ -150,7 +150,7 @@ def within(values: NDArray[np.floating[Any]], group: Group) -> Mask:
 
 
 def mostly_beyond(values: NDArray[np.floating[Any]], group: Group) -> str:
-    """What to say where most readings [n] lie beyond the range: then the others are none either. Empty elsewhere."""
+    """A line if most readings [n] lie beyond the range: then the others are no readings either. Else empty."""
     there = _known(values)
     share = 1.0 - float(within(there, group).mean()) if there.size else 0.0
     if share <= WRONG_SHARE_MOST:
@@ -181,7 +181,8 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     misread = spans_of(values)
     if misread is not None and misread.undone is not None:
         values = misread.undone
-    # Readings beyond the part's range are none: the engines leave them out. Of many it is known that they are beyond.
+    # Readings beyond the part's range are no readings: the engines leave them out. Many of them count as clipped,
+    # where the median is near the range.
     inside = within(values, group)
     if not (inside.any() and np.ptp(values[inside]) > 0.0):
         return Readings(recording, values, values, values, None, none, none, misread=misread)
@@ -192,7 +193,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         values = sound = np.clip(values, -group.range, group.range)
     lattice = lattice_of(_known(sound), recording.rate_hz)
     stuck, nats, stretches = _repeated(sound, lattice, group.stuck_limit)
-    new = np.where(stuck, np.nan, sound) if stuck.any() else sound  # held ones have more of the codes that were held
+    new = np.where(stuck, np.nan, sound) if stuck.any() else sound  # held readings have more of the held codes
     uneven = explained = None
     if misread is None and (lattice is None or not lattice.carried):
         explained = misread_of(new, lattice)
@@ -225,7 +226,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         working, drawn = _unclipped(sound, clipped, lattice)
     if moving.any():
         working, drawn = np.where(moving, np.nan, working), np.where(moving, values, drawn)
-    stuck, moving = (mask if mask.any() else none for mask in (stuck, moving))  # one array for all
+    stuck, moving = (mask if mask.any() else none for mask in (stuck, moving))  # they share an array
     saturated = 0 if clipped is None else int((clipped.mask | ~inside).sum())
     counts = {"saturated": saturated, "stuck": int((stuck | repeats).sum())}
     if recurring is not None:
@@ -250,7 +251,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
 
 
 def _known(values: NDArray[Any]) -> NDArray[Any]:
-    """Those of the values that are finite; no copy where all are."""
+    """The finite values; no copy where all are finite."""
     finite = np.isfinite(values)
     return values if finite.all() else values[finite]
 
@@ -259,7 +260,7 @@ def _known(values: NDArray[Any]) -> NDArray[Any]:
 
 
 def evened(recording: Recording) -> tuple[Recording, tuple[RateChange, ...]]:
-    """The recording on one even grid, where its rate changes: means over an interval that all rates share."""
+    """The recording on an even grid, where its rate changes: means over an interval that all rates share."""
     off = recording.off_grid_s
     if off is None:
         return recording, ()
@@ -386,13 +387,13 @@ def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]
     if not long.any() or n < 2 * size:
         return none, 0.0
     piece = np.minimum(np.arange(n) // size, n // size - 1)
-    _, code = np.unique(values, return_inverse=True)  # NaN are one code, and in no run
+    _, code = np.unique(values, return_inverse=True)  # NaN share a code, and are in no run
     _, cell, counts = np.unique(piece * np.int64(n) + code, return_inverse=True, return_counts=True)
     of_run = counts[cell[starts[long]]]
     del piece, code, cell  # as long as the record
     many, cells = np.unique(counts, return_counts=True)
     readings, row = many * cells, np.searchsorted(many, of_run)
-    # Chance of the first repeat, and of each later one; those that are alone show both.
+    # Chance of the first repeat, and of each later repeat; runs of two and of three show both.
     p = many / size
     pairs, (twos, threes) = float((p * readings).sum()), np.bincount(lengths, minlength=4)[2:4].tolist()
     alike = max(1.0, twos / max(pairs * (1.0 - pairs / n) ** 2, 1.0))
@@ -420,7 +421,7 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
     """Whole runs of equal readings [n] that are no chance, and the evidence in nats. `stated`: a length from which on a
     run is stuck whatever the chance; 0: none.
 
-    The chance that a reading repeats is the largest of three: the noise stays within one cell of the lattice, the level
+    The chance that a reading repeats is the largest of three: the noise stays within a cell of the lattice, the level
     in its middle; the share of repeats; their share among readings after a repeat, since a dead band has more.
     """
     n = values.size
@@ -447,7 +448,7 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
     stuck = lengths >= least
     frozen = values[change[stuck]]
     if 2 * int(lengths[stuck].sum()) > n and int((frozen == frozen[np.argmax(lengths[stuck])]).sum()) > 1:
-        return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
+        return none, 0.0  # a single reading most of the time: the noise at rest is below the lattice
     long = np.repeat(stuck, lengths)
     rest = np.where(long, np.nan, values) if long.any() else values
     steps = np.diff(rest)
@@ -479,7 +480,7 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
         others, count = values[np.isfinite(values) & ~at_edge], int(at_edge.sum())
         if count < CHANGED_LEAST or not (others.size and np.ptp(others) > 0.0):
             continue
-        # Where the others do not come near it, it is a word that the logger shows for lost ones.
+        # An edge that the others do not come near is a word that the logger writes for lost readings.
         if (lattice is not None and lattice.too_coarse) or is_limit(others, edge, count, step):
             sides.append((side, edge, at_edge))
     if not sides:
@@ -492,19 +493,19 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
 
 
 def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tuple[Array, Array]:
-    """Readings [n] to average in place of clipped ones, NaN for those left out: means of them have the level and the
-    spread that unclipped readings would have, and as many are left as the clipped record has information. And the
-    readings [n] with each clipped one drawn anew.
+    """Readings [n] to average in place of clipped readings, NaN where left out. Their means have the level and the
+    spread of unclipped readings. Their number is the information of the clipped record. And the readings [n] with each
+    clipped reading drawn anew.
 
-    A clipped reading shows that the true one lies beyond the limit (Tobit's model). To first order in the level the
+    A clipped reading shows that the true reading lies beyond the limit (Tobit's model). To first order in the level the
     scores of the readings hold all that the record shows of it. EM finds the level and the noise to take them at. With
     the noise as the unit a score has the variance I, the information of a reading. So the scores of 1 / I readings have
-    a sum of variance 1, as the deviation of one unclipped reading has.
+    a sum of variance 1, as the deviation of an unclipped reading has.
     """
     rows = np.flatnonzero(np.isfinite(values))
     y = values[rows]
     half = 0.5 * lattice.step if lattice is not None else 0.0
-    # A limit at or below the middle of the readings is a lower one.
+    # A limit at or below the middle of the readings is a lower limit.
     middle = 0.5 * (float(y.max()) + float(y.min()))
     at_upper, at_lower, high, low = *np.zeros((2, y.size), bool), math.inf, -math.inf
     for limit, mask in clipped.limits.items():
@@ -517,7 +518,7 @@ def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tupl
     sigma = float((y - level).std())
     score, information = y, y
     for _ in range(EM_STEPS_MOST):
-        # Where there is no limit, one beyond all normal readings has no part in the sums.
+        # Without a limit, a value beyond all normal readings adds nothing to the sums.
         up = np.clip((high - level) / sigma, -4.0, 37.0)
         down = np.clip((low - level) / sigma, -37.0, 4.0)
         # About the level, in the noise: the score of the level, the expected square and the expected information.
@@ -572,7 +573,7 @@ def _quiet_window(y: Array) -> int:
 
 
 def copied(recording: Recording, name: str, others: Sequence[str]) -> str:
-    """A line for a column that is a copy of one of the `others`, without noise of its own; else empty."""
+    """A line for a column that copies a column of `others`, without noise of its own; else empty."""
     own = np.diff(recording.columns[name].values)
     for other in others:
         theirs = np.diff(recording.columns[other].values)

@@ -1,4 +1,4 @@
-"""When a recording rested: what to say, in one line, of a record that lies outside the model's priors."""
+"""When a recording rested, and a line on a record that lies outside the model's priors."""
 
 from __future__ import annotations
 
@@ -79,8 +79,9 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> RestStretches:
 
 
 def outside_priors(recording: Recording, model: Model, axes: Sequence[str]) -> str:
-    """One line of all `axes` whose evidence every law denies: on which side of the priors they lie, their own Allan
-    deviation at 1 s, when the sensor moved, and the stretch of rest to type; or to widen the priors, if it rested."""
+    """A line on all `axes` whose evidence every law denies. It states the side of the priors, their own Allan deviation
+    at the bank interval, when the sensor moved, and the stretch of rest to type; or to widen the
+    priors, if it rested."""
     sides: dict[str, list[str]] = {}
     for name in axes:
         side, numbers = _side(recording, model, name)
@@ -97,7 +98,7 @@ def outside_priors(recording: Recording, model: Model, axes: Sequence[str]) -> s
 
 
 def _side(recording: Recording, model: Model, name: str) -> tuple[str, str]:
-    """Which prior an axis leaves, and its Allan deviation beside that prior's limit."""
+    """Which prior an axis leaves, and its Allan deviation with that prior's limit."""
     group, unit = model.group_of(name), recording.columns[name].unit
     block = bank_block(recording.rate_hz, model.bank_rate_hz)
     tau_s = block / recording.rate_hz

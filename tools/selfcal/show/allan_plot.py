@@ -141,7 +141,7 @@ def _of_means(allan: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _share_scales(panels: list[Any]) -> None:
-    """One scale for all panels of a unit, with room for the text above the curves."""
+    """A common scale for all panels of a unit, with room for the text above the curves."""
     for label in {panel.get_ylabel() for panel in panels}:
         same = [panel for panel in panels if panel.get_ylabel() == label]
         low, high = (choose(panel.get_ylim()[end] for panel in same) for end, choose in ((0, min), (1, max)))

@@ -55,8 +55,8 @@ class Band:
 
 @dataclass(frozen=True)
 class Panel:
-    """One chart. `marks`: instants or frequencies that a vertical line points out; `marked`: what they
-    are. `stairs`: a histogram's look."""
+    """A chart. `marks`: instants or frequencies that a vertical line points out; `marked`: what they are. `stairs`: a
+    histogram's look."""
 
     title: str
     x_label: str
@@ -123,7 +123,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """Panels on one scale, what they show (`caption`: the reader's sentence), and a name for the tables."""
+    """Panels on a common scale, what they show (`caption`: the reader's sentence), and a name for the tables."""
 
     name: str
     caption: str
@@ -229,7 +229,7 @@ def _x_limits(figure: Figure) -> tuple[float, float]:
 
 
 def draw(figure: Figure) -> Markup:
-    """The figure in HTML: its panels on one scale, caption, key, and a table behind them."""
+    """The figure in HTML: its panels on a common scale, caption, key, and a table behind them."""
     first, heights = figure.panels[0], [each for panel in figure.panels for each in panel.heights]
     right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
     return render(
@@ -243,8 +243,8 @@ def draw(figure: Figure) -> Markup:
 
 
 def strips(figure: Figure, marks: Sequence[tuple[float, float, str]]) -> Markup:
-    """The figure in HTML with its panels one below the other over one x, each on its own scale; `marks`: begin and end
-    of events with the text that stands above them."""
+    """The figure in HTML with its panels below each other over a common x, each on its own scale. `marks`: begin and
+    end of events with the text that stands above them."""
     right, bottom = STRIP_WIDTH - RIGHT, TOP + STRIP * len(figure.panels)
     x = _Scale(*_x_limits(figure), False, STRIP_LEFT, right - STRIP_LEFT)
     rows = []
@@ -323,7 +323,7 @@ def _stairs(px: Array, py: Array, stairs: bool) -> tuple[Array, Array]:
 
 
 def _path(px: Array, py: Array) -> str:
-    """Path data in steps of a tenth, relative: a third shorter than absolute ones."""
+    """Path data in steps of a tenth, relative: a third shorter than absolute steps."""
     corners = np.rint(10.0 * np.column_stack([px, py])).astype(int)
     steps = np.diff(corners, axis=0)
     text = "".join(_tenth(int(dx), "") + _tenth(int(dy), " ") + " " for dx, dy in steps if dx or dy)

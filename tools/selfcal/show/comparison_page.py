@@ -33,7 +33,7 @@ def comparison_html(document: Mapping[str, Any], curves: Curves) -> str:
 
 @dataclass(frozen=True)
 class Told:
-    """A line of the changes: one `change`, or one cause that appeared or is gone on several axes: all of it."""
+    """A line of the changes: a `change`, or a cause that appeared or is gone on several axes: all of it."""
 
     changes: list[tuple[str, Mapping[str, Any]]]
 
@@ -47,7 +47,7 @@ class Told:
 
     @property
     def unit(self) -> str:
-        """The unit of all axes; empty where they differ, or nothing has one."""
+        """The unit of all axes; empty where they differ, or nothing has a unit."""
         units = {change.get("unit", "") for _, change in self.changes}
         return str(units.pop()) if len(units) == 1 else ""
 
@@ -121,7 +121,7 @@ def _axis(
 
 
 def _deviations(name: str, curves: Mapping[str, Mapping[str, Any]], names: Mapping[str, str]) -> Markup:
-    """The Allan deviations of an axis on one scale; nothing where their units differ."""
+    """The Allan deviations of an axis on a common scale; nothing where their units differ."""
     panels = []
     for log, stated in curves.items():
         tau, measured, low, high = (np.array(stated[key]) for key in ("tau_s", "recording", "model_q05", "model_q95"))

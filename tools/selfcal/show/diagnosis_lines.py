@@ -94,7 +94,7 @@ def _numbers(axes: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def before_after(number: Mapping[str, Any]) -> str:
-    """One number of an axis."""
+    """A number of an axis."""
     after = number["after"]
     text = "–" if not after["identified"] else f"{after['median']:.3g}"
     if "q05" in after:
@@ -106,7 +106,7 @@ def before_after(number: Mapping[str, Any]) -> str:
 
 
 def _lines(finding: Mapping[str, Any]) -> list[str]:
-    """One finding in a few lines."""
+    """A finding in a few lines."""
     gain = finding["gain"]
     lines = [f"{finding['cause']}: {finding['words']}"]
     evidence = f"  evidence {words.evidence(finding)}"

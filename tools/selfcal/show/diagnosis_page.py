@@ -1,4 +1,4 @@
-"""The page of `selfcal diagnose --report`: one file that loads nothing, with pictures and the tables behind them."""
+"""The page of `selfcal diagnose --report`: a file that loads nothing, with pictures and the tables behind them."""
 
 from __future__ import annotations
 
@@ -222,7 +222,7 @@ def _sides(results: Mapping[str, Entry]) -> tuple[list[str], list[str], list[str
 
 
 def _readings(findings: Sequence[Entry], axes: Sequence[_Axis]) -> Markup:
-    """The readings of all axes over one time, the events marked by their numbers in the list."""
+    """The readings of all axes over a common time, the events marked by their numbers in the list."""
     marks = [(*times, str(row)) for row, finding in enumerate(findings, 1) for times in times_of(finding)]
     panels = []
     for axis in axes:
@@ -326,7 +326,7 @@ def _given(options: Options, leave: Sequence[str] = ()) -> str:
 
 
 def _model(document: Entry) -> str:
-    """The extended model file; "" without one."""
+    """The extended model file; else ""."""
     if not document.get("model"):
         return ""
     plain = json.loads(json.dumps(document["model"], default=float))  # numpy's numbers too

@@ -84,14 +84,14 @@ class SensorKind:
 def write_export(
     document: Mapping[str, Any], form: str, path: Path | str, overbound_level: float | None = None
 ) -> None:
-    """Write the answer of `identify` in one of FORMS: medians, or with an `overbound_level` the overbound at it. Raises
-    UserError where axes or laws are missing."""
+    """Write the answer of `identify` in a form of FORMS: medians, or with an `overbound_level` the overbound at it.
+    Raises UserError where axes or laws are missing."""
     gyro, accel = (_kind(document, unit, overbound_level) for unit in ("rad/s", "m/s^2"))
     write_text(path, text_of(form, gyro, accel, document["recording"]))
 
 
 def text_of(form: str, gyro: SensorKind, accel: SensorKind, recording: Mapping[str, Any]) -> str:
-    """The file of one of FORMS."""
+    """The file in a form of FORMS."""
     template = of_code(Path(__file__).parent / "templates" / "export").get_template(f"{FORMS[form]}.jinja")
     values = {"gyro": gyro, "accel": accel, "recording": recording, "PREDICT_S": PREDICT_S}
     return template.render(head=_head(gyro, accel, recording), **values)

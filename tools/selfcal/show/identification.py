@@ -306,7 +306,7 @@ def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
     events = _events(axes, passed=False)
     named = {name for _, names, _ in events for name in names}
     once = [{*names} for check, names, _ in events if check in ("turn_on", "jump")]
-    # An axis goes like another one by an event of both.
+    # An axis goes like another axis by an event of both.
     events = [
         event
         for event in events

@@ -67,7 +67,7 @@ def _shape(hint: Any) -> type:
 
 
 class Damaged(Object):
-    """What of the files could not be read: bytes, and the messages, frames or lines that they were, at least; and one
+    """What of the files could not be read: bytes, and the messages, frames or lines that they were, at least; and a
     line that says it."""
 
     bytes: int
@@ -122,7 +122,7 @@ class Bias(Object):
 
 
 class Check(Object):
-    """One check of the likeliest law."""
+    """A check of the likeliest law."""
 
     value: float | None
     limit: float | None
@@ -130,9 +130,9 @@ class Check(Object):
 
 
 class IdentifiedAxis(Object):
-    """One axis of `identify` or `replay`, or `error` alone. Probabilities and ln evidence (nats) by law; posteriors by
-    law and parameter. `adequate`: every check passed; None where none was made. `module_says`, `module_reason` and
-    `ahead`: of `replay`."""
+    """An axis of `identify` or `replay`, or `error` alone. Probabilities and ln evidence (nats) by law; posteriors by
+    law and parameter. `adequate`: every check passed; None without checks. `module_says`, `module_reason` and `ahead`:
+    of `replay`."""
 
     error: str | None
     hypotheses: dict[str, float]
@@ -158,7 +158,7 @@ class IdentifiedAxis(Object):
 
     @property
     def law(self) -> str:
-        """The most probable one."""
+        """The most probable law."""
         return max(self.hypotheses, key=lambda name: self.hypotheses[name])
 
 
@@ -173,7 +173,7 @@ class Picture:
 
 
 class Document(Object):
-    """What a verb answers. Its repr is what the command prints: `show` of the module `_shown_by` beside this one."""
+    """What a verb answers. Its repr is what the command prints: `show` of the module `_shown_by` in this folder."""
 
     _shown_by = ""
 
@@ -201,7 +201,7 @@ class Document(Object):
     def __repr__(self) -> str:
         try:
             return str(self._console().file.getvalue()).rstrip("\n")
-        except (KeyError, NotImplementedError):  # a part of a document, or one that has no table
+        except (KeyError, NotImplementedError):  # a part of a document, or a document without a table
             return super().__repr__()
 
     def _repr_html_(self) -> str:
@@ -286,8 +286,7 @@ class Event(Object):
 
 class Finding(Object):
     """A cause that explains something of the record: its evidence gain in nats, its size with interval and unit, the
-    time [begin, end] in s where it has one, what it gains on held-out data, and the causes that would explain as
-    much."""
+    time [begin, end] in s if any, what it gains on held-out data, and the causes that would explain as much."""
 
     cause: str
     words: str
@@ -311,7 +310,7 @@ class Finding(Object):
 
 
 class DiagnosedAxis(Object):
-    """One axis of `diagnose`, or `error` alone. `verdict`: "inadequate" with a finding that matters, or without a name.
+    """An axis of `diagnose`, or `error` alone. `verdict`: "inadequate" with a finding that matters, or without a name.
     `causes`: all of its own, `material`: those that matter. `numbers`: N, K and B before and after. `stated`: causes
     that it shows and the model file has already."""
 
@@ -355,7 +354,7 @@ class Diagnosis(Document):
             rows = list(axis.get("findings", ()))
             own = {finding.get("of") for finding in rows}
             for event in events.values():
-                if name in event["axes"] and event["id"] not in own:  # one of all axes together
+                if name in event["axes"] and event["id"] not in own:  # an event of all axes together
                     estimate = {**event["estimate"], **event["axes"][name]["estimate"]}
                     gain = {"evidence_gain_nats": event["evidence_nats"], "net_nats": event["net_nats"]}
                     rows.append({"cause": event["cause"], "of": event["id"], "estimate": estimate, **gain})

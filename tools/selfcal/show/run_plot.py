@@ -155,7 +155,7 @@ def _values(reports: Sequence[AxisReport], signal: str) -> Array:
 
 
 def _verdict(last: Mapping[int, float], truth: Any, hypotheses: Sequence[str]) -> tuple[str, str]:
-    """The most probable hypothesis with its probability, the true one if known; and its colour."""
+    """The most probable hypothesis with its probability, the true hypothesis if known; and its colour."""
     finite = {k: probability for k, probability in last.items() if math.isfinite(probability)}
     if not finite:
         return "outside the priors", "black"

@@ -135,7 +135,7 @@ def model() -> Json:
 
 
 def result(of: type[Object]) -> Json:
-    """Of a class of results. A number that JSON does not have (infinity) is null; an axis may have `error` alone."""
+    """Schema of a class of results. A number unknown to JSON (infinity) is null; an axis may have only `error`."""
     places: dict[str, Json] = {}
     main = _hint(of, places)
     return {"$schema": DIALECT, "title": str(of.__doc__).split("\n\n")[0], **main, "$defs": places}

@@ -29,7 +29,7 @@ ESTIMATE = ("mean", "sd", "q05", "median", "q95")
 
 
 def rows_of(model: Model, axis: str, duration_s: float, job: tuple[str, int]) -> list[Row]:
-    """One row: the law, the truth, the probabilities, and the estimates of the true law."""
+    """A row: the law, the truth, the probabilities, and the estimates of the true law."""
     from selfcal.bank.library import Bank
 
     law, seed = job

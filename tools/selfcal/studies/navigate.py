@@ -50,7 +50,7 @@ TOGETHER = 25
 
 @dataclass(frozen=True)
 class Job:
-    """Parts of one law, by their seeds."""
+    """Parts of a law, by their seeds."""
 
     law: str
     seeds: tuple[int, ...]
@@ -68,8 +68,8 @@ def identified_noise(rest: Array) -> list[Mapping[str, float]]:
     """By AXES: the noise of a rest [REST_S, axes] in their units, with the spread of its posterior.
 
     N has the mean square of all laws. Where the constant is the most probable law, there is no drift. Else the drift
-    has the variance that the bank predicts HORIZONS_S ahead, of all laws and nodes (`matched`): the variance of one law
-    at its median is too small where another law or a larger drift is possible.
+    has the variance that the bank predicts HORIZONS_S ahead, of all laws and nodes (`matched`). The variance of a
+    single law at its median is too small where another law or a larger drift is possible.
     """
     from selfcal.bank.library import Bank
 

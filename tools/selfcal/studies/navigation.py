@@ -10,7 +10,7 @@ The truth of the flight obeys them exactly. Errors are truth less estimate; the 
 body: R_true = R exp(theta). The error of w and f is the bias's, with the noise: theta' = theta x w - db, dv' = R (theta
 x f - db).
 
-GPS tells each second where the vehicle was LATENCY_S ago. The latency has an error that is constant and unknown, as in
+GPS shows each second where the vehicle was LATENCY_S ago. The latency has an error that is constant and unknown, as in
 the UAV example of the course on estimation by Mechbal, Guskov and Rebillat. The filter runs LATENCY_S late, so that it
 has the readings of that moment, and estimates the error of the latency. The present is dead reckoning from there.
 """

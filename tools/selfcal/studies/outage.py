@@ -1,12 +1,12 @@
 """What a finding of `diagnose` means in metres: the GPS/INS filter of navigation.py flies with the recorded errors.
 
 The bank learns noise and coefficients from the first half of the recording, as a module does: by the model with every
-finding, and by the model without one event. FLIGHTS begin in the second half, each after a rest. The errors of their
-readings are the recorded ones, less their level and less the columns that the model knows. Motion, GPS and the errors
+finding, and by the model without an event. FLIGHTS begin in the second half, each after a rest. The errors of their
+readings are the recorded errors, less their level and less the columns that the model knows. Motion, GPS and the errors
 at the start are simulated. An axis that was not judged has white noise: that of its kind, else the data sheet's.
 
-On a second recording the bank learns from the whole first one. Flights are in the second half of the second one. A
-size that belongs to one recording is learned from the first half of the second one, and an event is left to the noise.
+With a second recording the bank learns from the whole first recording. Flights are in the second half of the second. A
+size that belongs to a single recording is learned from the first half of the second, and an event is left to the noise.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from selfcal.studies.navigation import (
     nees,
 )
 
-#: Outages after which the position is judged, s; the one of the sentence is OUTAGE_S.
+#: Outages after which the position is judged, s; the sentence states OUTAGE_S.
 OUTAGES_S = (10, OUTAGE_S, LONGEST_OUTAGE_S)
 #: Flights, evenly spread; coordinates of a position.
 FLIGHTS, COORDINATES = 50, 3

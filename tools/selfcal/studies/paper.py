@@ -1,4 +1,4 @@
-"""`selfcal paper`: the figures of Stepanov & Motorin (2017) made anew, on one page with the paper's words."""
+"""`selfcal paper`: the figures of Stepanov & Motorin (2017) made anew, on a page with the paper's words."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ EXPLAINED = "adis16405_run1.npz"
 def with_reason(
     figures: Sequence[Reproduction], log: Path, diagnose: Callable[..., Mapping[str, Any]]
 ) -> list[Reproduction]:
-    """The figures of the real records, Fig. 5 with what the diagnosis finds in one of them."""
+    """The figures of the real records, Fig. 5 with the diagnosis of the record `log`."""
     entry = diagnose(log, axes=[section4.AXIS], decimate=1.0)["axes"][section4.AXIS]
     causes = [
         f"{finding['cause'].replace('_', ' ')} ({finding['evidence_gain_nats']:.0f} nats)"
@@ -39,7 +39,7 @@ def with_reason(
 
 
 def paper_html(figures: Sequence[Reproduction], records: int, seed: int) -> str:
-    """One self-contained page: a table of all figures, then each with its pictures."""
+    """A self-contained page: a table of all figures, then each with its pictures."""
     pictures = [[figure.figures] if isinstance(figure.figures, Figure) else figure.figures for figure in figures]
     drawn = [[draw(picture) for picture in own] for own in pictures]
     return str(render("paper.html", figures=list(zip(figures, drawn, strict=True)), records=records, seed=seed))

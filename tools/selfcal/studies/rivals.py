@@ -1,6 +1,6 @@
 """`selfcal rivals`: what other methods make of the same record: estimates, choice of a law, time and memory.
 
-With a recording, one table an axis. With a number of records instead, the same for simulated ones whose truth is known.
+With a recording, a table for each axis. With a number of records, the same for simulated records of known truth.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def of_recording(
 ) -> dict[str, Any]:
     """The document `selfcal.rivals/1`: the `chosen` methods on the same block means of each axis.
 
-    Each runs in a process of its own, one after the other, so that its time and its memory are its own. Numbers are in
-    the recording's units. A method that fails, or whose package is absent, has its reason in its place: {"error": ...}.
+    Each runs in a process of its own, in turn, so that its time and its memory are its own. Numbers are in the
+    recording's units. A method that fails, or whose package is absent, has its reason in its place: {"error": ...}.
     """
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
@@ -126,7 +126,7 @@ class Ensemble:
 
 
 def chosen_rivals(only: Sequence[str]) -> list[Rival]:
-    """Those named, in the order of the table. Raises UserError for a name that there is not."""
+    """The rivals in `only`, or all, in the order of the table. Raises UserError for an unknown name."""
     for name in only:
         if name not in RIVALS:
             raise UserError(f"--only: there is no rival '{name}' ({', '.join(RIVALS)})")
@@ -159,7 +159,7 @@ def longest_stretch(mean: Array) -> Array:
 
 
 def measured(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
-    """One method in a process of its own: its answer, its seconds of CPU, and its memory beyond the program's."""
+    """A method in a process of its own: its answer, its seconds of CPU, and its memory beyond the program's."""
     if rival.missing:
         return {"title": rival.title, "error": rival.missing}
     try:

@@ -153,7 +153,7 @@ def _position(gyro: After, accelerometer: After) -> Row:
 
 
 def simulated(model: Model, job: Job) -> list[Row]:
-    """One gyro stands for the upright one and for the one across: no figure has both."""
+    """A single gyro stands for the upright gyro and the gyro across: no figure has both."""
     after, truth, noise = {}, {}, {}
     for axis in ("gx", "ax"):
         y, truth[axis] = simulate_axis(job.law, job.rest_s + HORIZONS_S[-1], job.seed, axis=axis)

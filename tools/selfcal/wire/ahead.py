@@ -1,4 +1,4 @@
-"""How far the corrected output is off some time after a report: what a calibration is worth until the next one.
+"""How far the corrected output is off some time after a report: what a calibration is worth until the next.
 
 The bias that a module reports, with its coefficients' part of what the columns do meanwhile, against the readings then.
 """

@@ -51,7 +51,7 @@ def check_room(model: Model, tables: Tables, target: str, hold: bool = False) ->
 
 def bank_bytes(tables: Tables, axes: int = 0) -> int:
     """SELFCAL_MODEL_BYTES of the integer build for a core of 32 bits but for alignment (lib/selfcal_layout.h). `axes`:
-    of so many in place of all."""
+    of this many in place of all."""
     axes, p = axes or len(tables.axes), len(tables.regressors)
     regressors = 4 * (p + 1) * (p + 4) + axes * (8 * p + 24) if p else 0
     return tables.nodes * (56 + 20 * axes + regressors) + tables.term_nodes * (104 + 24 * p + 40 * axes)

@@ -1,7 +1,7 @@
 """DBC files of modules, written from the pattern `frames.dbc`.
 
-The pattern holds one message of each kind, for axis gx and hypothesis 0. Here it becomes a file with a message for
-every axis and hypothesis: `lib/selfcal.dbc`, with names of places, or the file of a module, with a model's names.
+The pattern holds a message of each kind, for axis gx and hypothesis 0. Here it becomes a file with a message for every
+axis and hypothesis: `lib/selfcal.dbc`, with names of places, or the file of a module, with a model's names.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ BASE, NODE_IDS, NODES = 0x200, 128, 12
 #: meaning is the item's.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 VALUE_BITS = COMMON["item"][0]
-#: Names of the places of a hypothesis' parameters where no model gives better ones.
+#: Names of the places of a hypothesis' parameters where no model gives better names.
 PLACE_NAMES = ("N", "p1", "p2")
 #: Signal of an axis's judgement whose words are those of every `reason_gx` to `reason_az`, too.
 REASON = "reason"
@@ -39,7 +39,7 @@ LETTERS_MOST = 32
 
 
 class DbcMessage(NamedTuple):
-    """One message of the file, made from one of the pattern."""
+    """A message of the file, made from a message of the pattern."""
 
     id: int
     name: str

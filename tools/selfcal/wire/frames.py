@@ -183,7 +183,7 @@ class AxisReport:
     node: int = 0
 
     def value(self, signal: str) -> float:
-        """One value, NaN if it did not arrive."""
+        """A value, NaN if it did not arrive."""
         return self.values.get(signal, math.nan)
 
     @property
@@ -278,7 +278,7 @@ class Adequacy:
     """What a module says of its model on an axis (lib/adequacy.c): words as in the DBC.
 
     `state` is adequate, inadequate or not_judged, the last with a `reason`. `suspicion` is the strongest, `score` in
-    standard deviations of its null law, over `samples` bank samples. `temperature_moved` is in degC, None without one.
+    standard deviations of its null law, over `samples` bank samples. `temperature_moved` is in degC, None if unknown.
     """
 
     state: str
@@ -346,7 +346,7 @@ def node_of(identifier: int) -> int | None:
 class Decoder:
     """Turns the frames of a node into reports and keeps the count of what went wrong.
 
-    `from_start`: the stream is watched from the module's first frame, so frames lost before the first accepted one
+    `from_start`: the stream is watched from the module's first frame, so frames lost before the first accepted frame
     count too.
     """
 
@@ -396,7 +396,7 @@ class Decoder:
     @property
     def twins(self) -> str:
         """What is wrong if two modules send as this node; empty if they do not. Their reports are of neither."""
-        # A restart within a status looks like one.
+        # A restart within a status looks like a twin.
         return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= RESYNC else ""
 
     @property
@@ -405,7 +405,7 @@ class Decoder:
         return bool(self.foreign) and self._others >= FOREIGN_STATUSES
 
     def feed(self, message: can.Message) -> list[AxisReport]:
-        """Take a frame; return the reports that it closes (none, one or two)."""
+        """Take a frame; return the reports that it closes (0 to 2)."""
         kind = _kinds().get(message.arbitration_id - BASE - NODE_IDS * self.node)
         special = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
         if kind is None or special or not message.dlc == LONGEST_FRAME == len(message.data):
@@ -486,7 +486,7 @@ class Decoder:
             self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
 
     def _look_for_twin(self, sent: int) -> None:
-        """Count a status that no single module can have sent, by the frames that have come since the last one.
+        """Count a status that no single module can have sent, by the frames that have come since the last status.
 
         More have come than were sent. Or the count goes on from where it was before it went back, and too few have come
         for that: after a restart the count begins anew."""
@@ -654,7 +654,7 @@ class Streams:
         return streams
 
     def feed(self, message: can.Message) -> list[AxisReport]:
-        """Take one frame of any node; return the reports that it closes."""
+        """Take a frame of any node; return the reports that it closes."""
         node = node_of(message.arbitration_id)
         if node is None:
             self.strangers.refused += 1
@@ -679,7 +679,7 @@ class Streams:
 
     @property
     def known(self) -> dict[int, Decoder]:
-        """The nodes that are no passing stranger, by number. Until there is one: whatever is heard."""
+        """The nodes that are no passing stranger, by number. Until then: all nodes that are heard."""
         heard = dict(sorted(self.decoders.items()))  # the view asks from a thread of its own
         sure = {
             node: decoder
@@ -730,7 +730,7 @@ class Link:
                     self.closed = True
                     break
                 self.malformed += 1
-                # python-can 4.6 keeps the line it cannot decode, so every later one would fail with it. Its flush()
+                # python-can 4.6 keeps the line it cannot decode, so every later line would fail with it. Its flush()
                 # would throw away good frames that wait behind.
                 self._shorten(0)
             except (OSError, can.CanError):
@@ -772,7 +772,7 @@ class Link:
             self.closed = True
 
     def close(self) -> None:
-        """Close channel and line; closed ones are no error."""
+        """Close channel and line; no error if they are closed."""
         import can
 
         try:

@@ -1,4 +1,4 @@
-"""The frame format for standard tools, for C and for the docs, from its one source, `frames.dbc`.
+"""The frame format for standard tools, for C and for the docs, from its only source, `frames.dbc`.
 
 python -m selfcal.wire.frames_codegen    write lib/selfcal.dbc, lib/selfcal_frames.h and the lists of lib/WIRE.md
 """
@@ -92,7 +92,7 @@ def _first(database: Database, suffix: str) -> Message:
 
 def header(database: Database) -> str:
     """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack: messages of other axes
-    and hypotheses are made from the first one's (dbc_file.py)."""
+    and hypotheses are made from the first's (dbc_file.py)."""
     columns = [_item(signal) for signal in fields(_first(database, "_COEFFICIENTS"))]
     if columns != list(range(3 * MOST_BANK_COLUMNS)):
         raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")

@@ -1,4 +1,4 @@
-"""Which model a module runs: the one whose tables have the `model_id` of its status."""
+"""Which model a module runs: the model whose tables have the `model_id` of its status."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from selfcal.wire.frames import AXES, wire_names
 
 
 class KnownModels:
-    """The default model, and that of the file `path`, with the diagnosis `start` that its module was built from. Raises
-    UserError for an invalid model, or the start of another one."""
+    """The default model, and the model of the file `path`, with the diagnosis `start` that its module was built from.
+    Raises UserError for an invalid model, or the start of another model."""
 
     def __init__(self, path: Path | str | None = None, start: Path | str | None = None) -> None:
         if start is not None and path is None:
@@ -48,7 +48,7 @@ class KnownModels:
 
 
 def _ids(model: Model, start: Start | None, interval_s: float, block: int) -> Iterator[int]:
-    """Of the model's tables for each target and each choice of axes that telemetry can carry, in the model's order."""
+    """Ids of the model's tables for each target and choice of axes that telemetry can carry, in the model's order."""
     if not 0.0 < interval_s < math.inf or block < 1:
         return
     sent = [axis for axis in model.axes if axis in AXES]

@@ -177,7 +177,7 @@ class Contact:
 
 @dataclass
 class LiveModule:
-    """One module that is heard: its last report of each axis with the last biases, and the module time then, s."""
+    """A module that is heard: its last report of each axis with the last biases, and the module time then, s."""
 
     decoder: Decoder
     last: dict[str, tuple[AxisReport, deque[float]]] = field(default_factory=dict)
@@ -204,8 +204,8 @@ class View:
     A progress bar if `total_s` is known. What did not arrive of a report is shown as `?`, never as an older value, and
     what the module has no number for as `-`. A module that has started anew has reported nothing yet. With `contact`
     silence counts: reports age, and a module that is not heard is not shown as running. `contacts`: that of each node.
-    `axes`: those to show; default all. `names` gives the names of a module by its status, `advice` what to do where
-    there are none.
+    `axes`: those to show; default all. `names` gives the names of a module by its status, `advice` what to do without
+    names.
     """
 
     heard: Streams | Decoder
@@ -310,7 +310,7 @@ class View:
         return Text(f"{said}, {step}", "green" if done else "yellow")
 
     def _next_step(self, module: LiveModule, shown: Sequence[str]) -> str:
-        """The next step for a module; "" without one."""
+        """The next step for a module; else ""."""
         contact, status = self._contact_of(module), module.decoder.status
         if wrong := module.decoder.foreign or module.decoder.twins:
             return wrong

@@ -51,7 +51,7 @@ class MonitorOutcome(Statistics):
 
 @dataclass
 class Run:
-    """One run of `monitor`: what the source gives is decoded, passed on and kept. `name` of the source; `axes` to pass
+    """A run of `monitor`: what the source gives is decoded, passed on and kept. `name` of the source; `axes` to pass
     on, all if empty; `contact` with a channel, None for a log."""
 
     source: Link | FrameLog
@@ -101,7 +101,7 @@ class Run:
             self.contact.heard(in_a_row=False, paced=any(contact.paced for contact in self.contacts.values()))
         if frame is not None:
             return frame, reports
-        # A module that saves is deaf for 1 to 2 s; a restarted one waits for the channel to be opened.
+        # A module that saves is deaf for 1 to 2 s; a restarted module waits for the channel to be opened.
         if self.contact is not None and min(self.contact.silent_s, time.monotonic() - self.opened_s) > SILENT_S:
             cast(Link, self.source).order("open")  # a module that has restarted waits for that
             self.opened_s = time.monotonic()
@@ -192,7 +192,7 @@ class Run:
 
 
 def keep(history: dict[str, list[AxisReport]], report: AxisReport) -> None:
-    """Add a complete report. One from before the last of its axis comes from a module that has started anew."""
+    """Add a complete report. A report from before the last of its axis comes from a module that has started anew."""
     if not report.complete:
         return
     if report.axis in history and report.time_s < history[report.axis][-1].time_s:

@@ -1,6 +1,6 @@
 """Axes of any name and unit on the wire of the host's module: each takes the message of an axis that it does not have.
 
-Telemetry has messages for six axes in fixed units. A number in it has no unit of its own, so any axis fits. Axes of one
+Telemetry has messages for six axes in fixed units. A number in it has no unit of its own, so any axis fits. Axes of a
 group take messages of the same unit, the accelerometer's first: the gate watches a gyro in its own way.
 """
 

@@ -179,7 +179,7 @@ def _make(name: str, target: str, root: Path, folder: Path) -> None:
     """Make a firmware in `folder`, which is relative to `root`: a path to that may hold spaces."""
     check_programs(target)
     command = ["make", "-s", "-f", f"port/{name}/{name}.mk", name, f"MODEL_DIR={folder}", f"OUT={folder}"]
-    # Of a `make` around this program nothing is passed on: neither its options nor its variables.
+    # Do not pass on the options and variables of a `make` around this program.
     environment = {key: value for key, value in os.environ.items() if key not in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL")}
     try:
         command.append(f"CORE={target}")
@@ -392,7 +392,7 @@ def _watch(
     patience_s: float = math.inf,
 ) -> None:
     """Follow the telemetry until the module has finished, or fallen silent. Of `history` retired axes without a report
-    are taken out. `module`: its program, if it has one."""
+    are taken out. `module`: its program, if any."""
     whole: dict[str, bool] = {}  # the axis's last report
     title = f"{recording.path.name}{' (SIMULATED)' if recording.meta.get('simulated') else ''}"
     with View(decoder, link, title, recording.duration_s, names=lambda status: wire_names(model)) as view:
@@ -463,7 +463,7 @@ def wire_document(
 
 
 def _identified(recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool) -> Identified:
-    """One axis by the firmware's last report. The checks of its law are made here, over the same samples."""
+    """An axis by the firmware's last report. The checks of its law are made here, over the same samples."""
     recording = recording.along(name)
     regressors, group, unit = offered(model, name), model.group_of(name), recording.columns[name].unit
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,))

@@ -23,7 +23,7 @@ def header(at_s: float, frame: str) -> dict[str, Any]:
 
 
 def diagnostics(report: Mapping[str, Any], at_s: float) -> dict[str, Any]:
-    """The DiagnosticArray of one report's content (`streams.content`): a status of its axis."""
+    """The DiagnosticArray of a report's content (`streams.content`): a status of its axis."""
     judged, laws = report.get("adequacy", {}), report["laws"]
     likeliest = _likeliest(report)
     # Levels as diagnostic_msgs has them: 0 OK, 1 WARN, 3 STALE.
@@ -71,7 +71,7 @@ def imu(reports: Mapping[str, Mapping[str, Any]], rate_hz: float, at_s: float) -
 
 
 def _known(report: Mapping[str, Any] | None, unit: str) -> tuple[float, float, float] | None:
-    """Bias, N and the bias' sd of a report, in `unit`; None where one of them is not there."""
+    """Bias, N and the bias' sd of a report, in `unit`; None where any of them is missing."""
     law = None if report is None else _likeliest(report)
     if report is None or law is None:
         return None

@@ -1,8 +1,8 @@
 """Reports of modules for other programs, as they come: JSON by UDP, by lines, by Foxglove's websocket, in MCAP files;
 messages of ROS 2 by lines.
 
-Each report is one JSON object. PlotJuggler takes the form of UDP and lines: its curves are node0/gx/bias/mean and so
-on, and `timestamp` is the host's clock when the report came, s since 1970. Foxglove and MCAP have a topic an axis,
+Each report is a JSON object. PlotJuggler takes the form of UDP and lines: its curves are node0/gx/bias/mean and so on,
+and `timestamp` is the host's clock when the report came, s since 1970. Foxglove and MCAP have a topic an axis,
 /selfcal/node0/gx, and the same numbers in it.
 """
 

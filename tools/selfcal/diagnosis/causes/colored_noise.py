@@ -1,6 +1,6 @@
 """White noise with memory: a moving average, whose correlation cuts off, or a first-order process.
 
-A moving average of neighbours that pull apart is white noise beside quantization noise: quantization_noise.py."""
+A moving average of neighbours that pull apart is white noise with quantization noise: quantization_noise.py."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def _sizes(chosen: Fit) -> dict[str, Any]:
 def _extend(at: Extension) -> None:
     """A law for white noise with memory.
 
-    A first-order process at the bank's own rate is a Gauss-Markov drift of its correlation time, beside a walk. Block
-    means of a faster one, and a moving average, are correlated with their neighbours alone."""
+    A first-order process at the bank's own rate is a Gauss-Markov drift of its correlation time, next to a walk. Block
+    means of a faster process, and a moving average, are correlated with their neighbours alone."""
     tree, fit = at.tree, at.found[at.axis].state.best
     correlation = math.tanh(fit.value("color"))
     at_bank_rate = abs(fit.dt * float(tree["bank_rate_hz"]) - 1.0) < 0.01

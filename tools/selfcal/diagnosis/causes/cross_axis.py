@@ -1,4 +1,4 @@
-"""Another axis leaks into this one: at once, through a filter, by its rate or its square."""
+"""Another axis leaks into this axis: at once, through a filter, by its rate or its square."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RATE_WINDOWS_S = (0.0, 5.0, 20.0, 60.0, 150.0)
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """One look for every other axis."""
+    """A look for every other axis."""
     others = {name: values for name, values in record.other_axes(state.axis).items() if np.ptp(values) > 0.0}
     return channel_looks.look(state, [_channel(record, name, values) for name, values in others.items()])
 
@@ -50,11 +50,11 @@ def _channel(record: Record, name: str, values: Array) -> Channel:
 
 
 def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
-    """Two axes that each blame the other: the reading that follows is the one that gains more by it.
+    """Keep the axis that gains more as the follower, where two axes each blame the other.
 
-    White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, one source of
-    several axes is likelier than several of one; and of one pair the weaker coupling is kept: a mechanical one is
-    below 1."""
+    White noise correlates both ways alike, and only the drifts distinguish the two. Where they do not, a common source
+    of several axes is likelier than several sources of an axis. Of a lone pair the weaker coupling is kept: a
+    mechanical coupling is below 1."""
     _arms(record, found)
     _own_ramps(record, found)
     _star(record, found)
@@ -63,7 +63,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     partners = _partners(found)
     for (name, other), finding in pairs.items():
         back = pairs.get((other, name))
-        if back is None:  # the other one may follow by a lag or a rate alone
+        if back is None:  # the other axis may follow by a lag or a rate alone
             source = found[other].state if other in found else record.axes[other]
             known = source.best.ln_likelihood - without_axis(source, name).best.ln_likelihood
             if known > finding.look.gain - ALIKE:
@@ -99,7 +99,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
 
 
 def leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
-    """Of each leak the axis that follows, the other one, and the finding."""
+    """Leaks: the axis that follows, the other axis, and the finding of each."""
     return [
         (name, str(finding.look.estimate["other"]), finding)
         for name, axis in found.items()
@@ -125,8 +125,8 @@ def _drop(axis: Diagnosed, other: str, free: State) -> None:
 
 
 def _arms(record: Record, found: Mapping[str, Diagnosed]) -> None:
-    """Give the source that all axes together show best to each axis that it leaks into: none need show it alone. Beside
-    a quantity the white noise of the axes must show it too."""
+    """Give the source that all axes together show best to each axis that it leaks into: no axis need show it alone.
+    With a quantity the white noise of the axes must show it too."""
     gains = dict.fromkeys(found, 0.0)
     for name, axis in found.items():
         others = {other: values for other, values in record.other_axes(name).items() if other in found}
@@ -168,7 +168,7 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> None:
 
 
 def _weigh_anew(found: Mapping[str, Diagnosed]) -> None:
-    """Weigh a quantity beside the leaks: without them it takes the drift of a source for itself."""
+    """Weigh a quantity together with the leaks: without them it takes the drift of a source for itself."""
     quantity = next((axis.hidden for axis in found.values() if axis.hidden is not None), None)
     own = any(finding.look.estimate.get("source") != hidden.ID for _, _, finding in leaks(found))
     if quantity is None or not own or not {*quantity.names} <= found.keys():
@@ -180,8 +180,8 @@ def _weigh_anew(found: Mapping[str, Diagnosed]) -> None:
 
 
 def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
-    """Turn a leak about, where the axis that follows goes together with more axes than the other one does, and the
-    other way round explains it nearly as well."""
+    """Turn a leak about, if its follower goes together with more axes than its source does, and the reverse explains
+    it nearly as well."""
     partners = _partners(found)
     for name, other, finding in leaks(found):
         if partners[name] <= partners[other] or other not in found:
@@ -200,10 +200,10 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
 def _source_shown(
     record: Record, found: Mapping[str, Diagnosed], name: str, other: str, findings: Sequence[Finding]
 ) -> bool:
-    """Whether the record shows that the other axis is the source: not this one, and no third one of both. `findings`:
-    all of the pair, of which one source is asked.
+    """Whether the record shows that the other axis is the source: not this axis, and no third axis of both. `findings`:
+    all of the pair, which share the verdict.
 
-    The joint likelihood of both axes must be clearly larger with this one following than with the other following. A
+    The joint likelihood of both axes must be clearly larger with this axis following than with the other following. A
     lag has a direction in time as well: where the other axis' future explains as much as its past, or adds to it, both
     follow a third.
     """
@@ -217,7 +217,7 @@ def _source_shown(
 
 
 def _is_late(final: State, finding: Finding, values: Array) -> bool:
-    """Whether the past of the other axis `values` [n] explains a lag, and its future neither instead nor beside it."""
+    """Whether the past of the other axis `values` [n] explains a lag, and its future neither instead nor as well."""
     lag_s = float(finding.look.estimate["lag_s"]["median"])
     early = formed(values[::-1], "lag", lag_s, 0.0, final.dt)[::-1]
     beside = final.without({regressor.name for regressor in finding.columns if form_of(regressor)[2] == "lag"})
@@ -237,7 +237,7 @@ def without_axis(state: State, other: str) -> State:
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:
-    """Of the axis that would have to leak most."""
+    """Least coefficient of the axis that would have to leak most."""
     sizes = {name: state.least(values) for name, values in record.other_axes(state.axis).items()}
     sizes = {name: value for name, value in sizes.items() if math.isfinite(value)}
     if not sizes:

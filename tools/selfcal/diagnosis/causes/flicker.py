@@ -1,4 +1,4 @@
-"""Flicker (1/f) noise, beside either drift or alone."""
+"""Flicker (1/f) noise, with either drift or alone."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from selfcal.likelihood.fit import Fit, best
 from selfcal.likelihood.state import Look, State, net, of_parameter
 
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The size of 1/f noise is at its limit of nothing in
-#: most of them: 11 instead of 68 showed 3 nats at the price of one look.
+#: most of them: 11 instead of 68 showed 3 nats at the price of a single look.
 LN_LOOKS = -1.5
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """1/f noise beside either drift, which may be nothing there."""
+    """1/f noise with either drift, which may be nothing there."""
     if state.extras.flicker:
         return []
     gain, fits = state.with_terms({}, flicker=True)

@@ -17,8 +17,8 @@ from selfcal.likelihood.state import Look
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:
-    """The mean of each reading's time, on the lattice, until the next one. In each of so many `intervals`, a tenth of
-    its piece of the record, one reading is held instead."""
+    """Hold the mean of each reading's time, on the lattice, until the next reading. With `intervals`, hold single
+    readings instead, in a tenth of each piece of the record."""
     if "intervals" in keys:
         ratio, piece = max(2, round(rate_hz / keys["rate_hz"])), row.size // keys["intervals"]
         for k in range(keys["intervals"]):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, count_key, medians, shown
 
-#: Missing samples are told of from this share on.
+#: Share of missing samples above which they are reported.
 MISSING_LEAST = 1e-3
 
 CAUSE = Cause(

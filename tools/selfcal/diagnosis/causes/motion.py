@@ -10,7 +10,7 @@ from selfcal.readings.moves import Moved, motion_events
 
 
 def look_of(moved: Moved) -> Look:
-    """The finding of one axis."""
+    """The finding of an axis."""
     intervals = [list(each) for each in moved.intervals]
     size = {"ratio": {"median": moved.ratio, "unit": "1"}} if moved.ratio > 0.0 else {}
     when = (intervals[0][0], intervals[-1][1])
@@ -18,7 +18,7 @@ def look_of(moved: Moved) -> Look:
 
 
 def _meet(a: Look, b: Look) -> bool:
-    """Whether two axes moved at one time."""
+    """Whether two axes moved at the same time."""
     return len(motion_events({"a": a.estimate["intervals"], "b": b.estimate["intervals"]})) == 1
 
 

@@ -48,7 +48,7 @@ def looks(state: State, record: Record) -> list[Look]:
 
 def _line(state: State, record: Record, found: Swing) -> list[Look]:
     """The line of this period where it explains as much: swings that keep their phase over the whole record have no
-    damping. Of the band in which oscillations are looked for."""
+    damping. Its price is for the band in which oscillations are looked for."""
     period, _, _ = found.numbers
     width = 1.0 / (state.y.size * state.dt)
     tried = (1.0 / period + width * np.linspace(-1.0, 1.0, 17)).tolist()
@@ -76,7 +76,7 @@ def _alike(a: Look, b: Look) -> bool:
 
 
 def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
-    """From sample to sample by the exact transition."""
+    """The oscillation [n], by the exact transition from sample to sample."""
     t = channels.time_s
     F = turned(keys["period_s"], keys["damping"], float(t[1] - t[0]))
     law = Matrices(F, np.eye(2) - F @ F.T, np.array([float(keys["sd"]), 0.0]), np.eye(2), 0.0)
@@ -84,7 +84,7 @@ def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
 
 
 def _extend(at: Extension) -> None:
-    """A law of a walk beside the oscillation, whose size is free. One that states the same period already serves."""
+    """A law of a walk and the oscillation, whose size is free. A law that states the same period already serves."""
     estimate, final = at.finding.look.estimate, at.found[at.axis].state
     period = estimate["period_s"]
     if any(period["q05"] <= other <= period["q95"] for other in _periods(at.tree)):
@@ -110,7 +110,7 @@ def _extend(at: Extension) -> None:
 
 
 def _periods(tree: Mapping[str, Any]) -> list[float]:
-    """Of the oscillations that a model states."""
+    """Periods of the oscillations that a model states, s."""
     laws = [law["terms"] for law in tree["hypotheses"].values() if isinstance(law, Mapping)]
     terms = [term for terms in laws for term in terms if isinstance(term, Mapping)]
     return [float(term["period_s"]) for term in terms if term["kind"] == "oscillation"]

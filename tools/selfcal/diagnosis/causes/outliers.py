@@ -1,4 +1,4 @@
-"""Single samples that are far off: a mixture of the innovations with a share of wider ones."""
+"""Single samples that are far off: a mixture of the innovations with a share of wider innovations."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from selfcal.likelihood.state import NET_LEAST, Look, State, net, normal_entry
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The two numbers of a mixture are at their limits in
 #: most of them: 5 instead of 1350 / e gained 2.5 nats.
 LN_LOOKS = -1.5
-#: Outliers are exceptions: a look that takes more of the samples for them has another cause.
+#: Largest share of outliers among the samples: a look with more has another cause.
 OUTLIERS_MOST = 0.05
-#: Readings on no lattice that repeat the one before more often than this share are no noise with exceptions.
+#: Share of readings on no lattice that repeat the reading before, above which they are no noise with exceptions.
 REPEATS_MOST = 0.5
-#: Standard deviations of a sample beyond which a module keeps it out: of normal noise one in 5e8.
+#: Standard deviations of a sample beyond which a module keeps it out: of normal noise 1 in 5e8.
 KEPT_OUT_SD = 6.0
 
 
@@ -31,7 +31,7 @@ def looks(state: State, record: Record) -> list[Look]:
 
 
 def mixed(state: State, record: Record) -> list[Look]:
-    """A mixture of the innovations with a share of wider ones."""
+    """A mixture of the innovations with a share of wider innovations."""
     w = state.whitened
     present = np.isfinite(w)
     x = w[present]
@@ -97,7 +97,7 @@ def mixed(state: State, record: Record) -> list[Look]:
 
 
 def _aftermath(state: State, kept: Array) -> float:
-    """ln likelihood that the other readings gain where the wild ones are left out of `kept` [n].
+    """ln likelihood that the other readings gain where the wild readings are left out of `kept` [n].
 
     A reading that is off by itself spoils the predictions that follow. A jump of the drift foretells them: without it
     they are worse, and it is no outlier."""
@@ -110,7 +110,7 @@ def _aftermath(state: State, kept: Array) -> float:
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
-    """One sample so far off that its evidence pays for the choice among n."""
+    """A sample so far off that its evidence pays for the choice among n."""
     return {"deviation": (math.sqrt(2.0 * (NET_LEAST + math.log(state.best.n))) * state.best.sigma, state.unit)}
 
 

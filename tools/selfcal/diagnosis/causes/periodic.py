@@ -1,4 +1,4 @@
-"""A spectral line: the periodogram of the innovations; harmonics of one fundamental are one finding."""
+"""A spectral line: the periodogram of the innovations; harmonics of a fundamental make a single finding."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from selfcal.likelihood.columns import LN_SLOW, Shape
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import ALIKE, FittedColumn, Look, State, net, normal_entry
 
-#: Fewer turns in a record than this are drift.
+#: Least turns of a line in a record: fewer are drift.
 TURNS_LEAST = 1.5
-#: A line of fewer turns is as slow as a drift: its gain must hold over all possible drifts, and its search costs more.
+#: Turns below which a line is as slow as a drift: its gain must hold over all possible drifts, its search costs more.
 SLOW_TURNS = 30.0
-#: Two axes know the frequency of one line to so many turns in the record: nearer ones share a column.
+#: Turns in the record to which two axes know the frequency of a line: nearer lines share a column.
 SAME_TURNS = 0.25
-#: A band wider than this share of a line's frequency lies at one of its multiples by chance.
+#: Share of a line's frequency: a wider band lies at a multiple of the line by chance.
 HARMONIC_MOST = 0.1
-#: Lines whose frequencies, or multiples of them, differ by less than this share are one event.
+#: Distance of two lines' frequency ratio from a whole number, below which they are the same event.
 ONE_LINE = 0.01
 #: Share of its frequency within which another line is a side band.
 SIDE_BAND = 0.1
@@ -41,7 +41,7 @@ def looks(state: State, record: Record) -> list[Look]:
 
 
 def _band(state: State) -> list[Look]:
-    """A fast swing that noise drives (swing.py). Slow ones are the bias's own (oscillation.py)."""
+    """A fast swing that noise drives (swing.py). Slow swings are the bias's own (oscillation.py)."""
     found = swing.found(state, slow=False) if len(state.extras.bands) < swing.SWINGS_MOST else None
     if found is None or found.keeps_phase:
         return []
@@ -69,8 +69,8 @@ def pair(f: float, record: Record) -> dict[str, Array]:
 
 
 def _power(f: float, t: Array, w: Array, there: Mask) -> float:
-    """What a line gains in white noise `w` [n], 0 where it is not `there`: least squares, as sine and cosine are not
-    orthogonal near half the rate, and one column at it."""
+    """Gain of a line in white noise `w` [n], 0 where it is not `there`: least squares, as sine and cosine are not
+    orthogonal near half the rate, and a single column at half the rate."""
     turn = np.exp(-2j * math.pi * np.mod(f * t, 1.0))
     z, twice, n = complex(turn @ w), complex((turn[there] ** 2).sum()), float(there.sum())
     room = n**2 - abs(twice) ** 2
@@ -80,8 +80,8 @@ def _power(f: float, t: Array, w: Array, there: Mask) -> float:
 
 
 def ln_lines(turns: Array, n: int, gain: Array) -> Array:
-    """ln of the number of independent lines that one of so many `turns` among `n` samples, which gains so much, is the
-    best of. The prior of a frequency is flat in its logarithm: a slow line is one of few.
+    """ln of the number of independent lines of which a line is the best, by its `turns` among `n` samples and its
+    `gain`. The prior of a frequency is flat in its logarithm: slow lines are few.
 
     The frequency is continuous: between two bins of the periodogram lies a larger maximum (Baluev 2008, MNRAS 385,
     1279, equation 6, for even sampling)."""
@@ -105,7 +105,7 @@ def shape(state: State, record: Record, f: float, sd: float = 0.0, multiples: Se
         return sd or share * math.sqrt(12.0) / (2.0 * math.pi * n * state.dt)
 
     def sharper(fit: Fit) -> Shape:
-        """The null's drift has swallowed a part of a line: the likeliest beside the drift that is left beside it."""
+        """The likeliest line at the drift fitted with it: the null's drift has swallowed a part of a line."""
         move = min(0.5 * spread(fit), 0.25 * (half - f))
         three = state.scores([waves(f + k * move) for k in (-1, 0, 1)], fit)
         bend = 2.0 * three[1] - three[0] - three[2]
@@ -130,6 +130,7 @@ def shape(state: State, record: Record, f: float, sd: float = 0.0, multiples: Se
         stated={"harmonics": list(multiples)} if multiples else {},
         sharper=sharper if f < half else None,
         where=lambda fit: {"frequency_hz": normal_entry(f, spread(fit), "Hz")},
+        waves=len(pair(f, record)),
     )
 
 
@@ -151,7 +152,7 @@ def _line(state: State, record: Record) -> list[Look]:
     for move in 0.25 ** np.arange(1.0, 5.0):
         near = np.minimum(f + move * width * np.linspace(-1.0, 1.0, 9), half)
         f = float(near[int(np.argmax([_power(frequency, t, w, there) for frequency in near]))])
-    # A line at half the rate also fits beside it, with a column and a frequency more than it needs.
+    # A line at half the rate also fits next to it, with a column and a frequency more than it needs.
     tried = [*([shape(state, record, half)] if f > half - TURNS_LEAST * width else []), shape(state, record, f)]
     return columns.looks(state, "periodic", tried, slow=f < SLOW_TURNS * width)
 
@@ -171,7 +172,7 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
 
 
 def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
-    """Lines that axes have in common have one frequency, that of the axis that shows it best."""
+    """Give lines that axes have in common the same frequency: the axis that shows the line best decides."""
     lines = [
         (name, finding)
         for name, axis in found.items()
@@ -205,7 +206,7 @@ def _hz(look: Look) -> float:
 
 
 def _harmonics(axis: Diagnosed) -> None:
-    """Lines at multiples of a slower one's frequency are one finding with it: their gains are added."""
+    """Merge lines at multiples of a slower line's frequency into its finding: their gains are added."""
     found = (f for f in axis.findings if f.look.cause == "periodic")
     lines = sorted(found, key=lambda f: _hz(f.look))
     for base in lines:
@@ -261,7 +262,7 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
 
 
 def _alike(a: Look, b: Look) -> bool:
-    """One line, a harmonic, or a side band."""
+    """Whether two lines are the same line, harmonics, or side bands."""
     f, g = sorted(map(_hz, (a, b)))
     times = g / f
     return abs(times - round(times)) < ONE_LINE or times < 1.0 + SIDE_BAND
@@ -273,7 +274,7 @@ def _pictures(look: Look) -> Sequence[str]:
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
-    """A line half way between the slowest one looked for and the fastest, in octaves."""
+    """A line half way between the slowest line looked for and the fastest, in octaves."""
     frequency = math.sqrt(TURNS_LEAST / record.time_s[-1] * 0.5 * record.rate_hz)
     found = columns.least(state, shape(state, record, frequency), "amplitude")
     return {**found, "frequency_hz": (frequency, "Hz")}
@@ -284,8 +285,8 @@ def _of_column(column: FittedColumn, c: Sequence[float]) -> dict[str, Any]:
 
 
 def _advice(look: Look, record: Record) -> str:
-    """A line of few turns may be a drift. One of fewer than four readings a turn is near half of the rate:
-    it may be an alias of a faster one, and moves with the rate."""
+    """A line of few turns may be a drift. A line of fewer than four readings a turn is near half of the rate: it may be
+    an alias of a faster line, and moves with the rate."""
     turns = _hz(look) * float(record.time_s[-1])
     if turns < SLOW_TURNS:
         beside = "" if "temperature" in record.channels else ", with the temperature at the sensor"

@@ -1,4 +1,4 @@
-"""A pulse of the bias: a step, and after a while one back of the same size. Each alone may be weak.
+"""A pulse of the bias: a step, and after a while a step back of the same size. Each step alone may be weak.
 
 Pairs of places on a coarse grid of block means are ranked, and the best single step is tried as a pulse's start and as
 its end.
@@ -25,15 +25,15 @@ from selfcal.likelihood.state import Look, State
 
 #: Places of a step among which pairs are looked for, of blocks.
 PAIR_PLACES = 96
-#: Pairs that are tried, and how far they are apart, places.
+#: Most pairs that are tried, and how far they are apart, places.
 TRIED, PAIRS_APART = 2, 3
-#: Two steps that gain so much more with sizes of their own, nats and share of the gain, are no pulse. Of pulses 2 in
-#: 1000 do by chance; the share is that of sizes a third apart.
+#: Gain of two steps by sizes of their own, nats and share of the gain, above which they are no pulse. Of pulses 2 in
+#: 1000 gain as much by chance; the share is that of sizes a third apart.
 UNEQUAL, UNEQUAL_SHARE = 5.0, 0.03
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """The best pair of places, where its steps are of one size."""
+    """The best pair of places, where its steps are of the same size."""
     n = state.y.size
     if n < 10 * EDGES_APART:
         return []
@@ -44,7 +44,7 @@ def looks(state: State, record: Record) -> list[Look]:
     for look in found:
         column = look.changes["regressors"][-1].values
         ends = raised(n, int(np.flatnonzero(column)[-1]) + 1)
-        # At one drift: a drift that forgets and a step are as good as a walk, for any record.
+        # At the same drift: a drift that forgets and a step are as good as a walk, for any record.
         alike, apart = state.scores([column, np.array([column, ends])], state.with_columns(column)[1])
         if apart - alike > max(UNEQUAL, UNEQUAL_SHARE * look.gain):
             return []
@@ -90,7 +90,7 @@ def _of_step(state: State, steps: Scan) -> list[tuple[Fit, tuple[int, int]]]:
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
-    """One of a tenth of the record in its middle."""
+    """A pulse of a tenth of the record in its middle."""
     n = record.present.size
     places = (round(0.45 * n), round(0.55 * n))
     return columns.least(state, edges.shape(state, "pulse", places, scan(state.series, state.best)), "amplitude")

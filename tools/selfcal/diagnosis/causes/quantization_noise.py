@@ -25,7 +25,7 @@ from selfcal.likelihood.state import NET_LEAST, Look, State, net, normal_entry
 from selfcal.likelihood.statemodel import Terms
 from selfcal.model.laws import RATIO_LIMITS
 
-#: The prior of the spectral ratio reaches so many times either way about the recording's, and never above 1.
+#: Factor by which the prior of the spectral ratio reaches either way about the recording's, and never above 1.
 WITHIN = 5.0
 
 
@@ -40,7 +40,7 @@ def look_of(fit: Fit, gain: float, state: State, extras: Terms) -> Look:
 
 
 def _measured(unit: str, final: State) -> dict[str, Any]:
-    """As the final fit has them; a coefficient that has changed its sign there has none."""
+    """Sizes of the final fit; empty if the coefficient has changed its sign there."""
     return _sizes(unit, final.best) if final.best.quantized else {}
 
 
@@ -56,7 +56,7 @@ def _sizes(unit: str, fit: Fit) -> dict[str, Any]:
 
 
 def _law(tree: dict[str, Any], look: Look) -> None:
-    """White noise of the spectral ratio that the look has at the bank's rate, within a factor, beside a walk."""
+    """White noise of the spectral ratio that the look has at the bank's rate, within a factor, with a walk."""
     Q, N = (float(look.estimate[key]["median"]) for key in ("Q", "N"))
     ratio = 1.0 / math.sqrt(1.0 + 4.0 * (Q / N) ** 2 * float(tree["bank_rate_hz"]))
     limits = digits(max(ratio / WITHIN, RATIO_LIMITS[0]), 2), digits(min(ratio * WITHIN, 1.0), 2)

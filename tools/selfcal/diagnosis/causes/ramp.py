@@ -13,7 +13,7 @@ from selfcal.model.regressors import coefficient_unit
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """One look while the model has no ramp."""
+    """A look while the model has no ramp."""
     known = any(regressor.name == "time" for regressor in state.regressors)
     return [] if known else columns.looks(state, "ramp", [_shape(state, record)])
 

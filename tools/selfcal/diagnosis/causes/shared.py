@@ -1,7 +1,7 @@
 """Noise that two axes share: a common source reaches both, at every frequency or in a band.
 
 The innovations of the two final models go together. Neither axis predicts the other, so no column enters a model, and
-a module does not know of it. The gain is the joint log score of the pair less the sum of the single ones.
+a module does not know of it. The gain is the joint log score of the pair less the sum of the single scores.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from selfcal.diagnosis.record import Record
 from selfcal.likelihood.columns import LN_EITHER
 from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, net, normal_entry
 
-#: Bands are thirds of an octave, of so many bins of the spectrum at least.
+#: Bands of an octave, and least bins of the spectrum in a band.
 OCTAVE_PARTS, BINS_LEAST = 3, 16
-#: An innovation counts as so many standard deviations at most: an event on both axes is no noise.
+#: Most standard deviations that an innovation counts as: an event on both axes is no noise.
 CLIP = 4.0
-#: Bins so far above the largest of noise, in units of their band's power, hold a line. Neighbours are left out too.
+#: Power of a line above the largest bin of noise, in units of the band's power; neighbours that are left out with it.
 LINE_LEAST, LINE_HALF = 4.0, 2
 #: Pieces of the record at most, over which the correlation must be steady.
 STEADY_PIECES_MOST = 64
-#: A band of noise has half a width of this share of its frequency at least, and of so many bins of the spectrum. A
-#: narrower one is a disturbance of that frequency.
+#: Least half width of a band of noise, as a share of its frequency, and in bins of the spectrum. A narrower band is a
+#: disturbance of that frequency.
 BROAD, BROAD_BINS = 0.02, 4.0
 #: Share of a common source's gain that the innovations of two drifts may not show.
 LOST = 0.1
@@ -45,7 +45,8 @@ Spectrum = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Pair:
-    """Whitened innovations `u`, `v` [n] of two axes, `dt` s apart; 0 where one is missing. `present`: that are not."""
+    """Whitened innovations `u`, `v` [n] of two axes, `dt` s apart; 0 where either is missing. `present`: number of the
+    others."""
 
     u: Array
     v: Array
@@ -71,7 +72,7 @@ class Pair:
 
     @cached_property
     def spectra(self) -> tuple[Spectrum, Spectrum]:
-        """The same with a mean power of 1 in each band: a slope that a model leaves counts for nothing."""
+        """`raw` with a mean power of 1 in each band: a slope that a model leaves counts for nothing."""
         U, V = (
             spectrum / np.append(1.0, np.repeat(self._level(spectrum), np.diff(self.edges))) for spectrum in self.raw
         )
@@ -94,7 +95,7 @@ class Pair:
 
     @cached_property
     def sums(self) -> tuple[Spectrum, Array, Array]:
-        """Of the bins of each band: cross spectrum, product of both powers, bins."""
+        """Sums over the bins of each band: cross spectrum, product of both powers, bins."""
         U, V = self.spectra
         product = np.abs(U * V) ** 2
         rows = (U * np.conj(V), product, (product > 0.0).astype(float))
@@ -122,7 +123,7 @@ class Common:
 
 
 def pair_of(u: Array, v: Array, dt: float) -> Pair:
-    """Of residual innovations with standard deviation 1 [n], NaN where they are missing."""
+    """`Pair` of residual innovations with standard deviation 1 [n], NaN where they are missing."""
     both = np.isfinite(u) & np.isfinite(v)
     first, second = (np.where(both, np.clip(x, -CLIP, CLIP), 0.0) for x in (u, v))
     return Pair(first, second, dt, int(both.sum()))
@@ -165,7 +166,7 @@ def common(pair: Pair, ln_pairs: float = 0.0) -> Common | None:
 
 
 def _gain(bins: Array, coherence: Spectrum | complex) -> Array:
-    """Of ln likelihood, by a coherence over so many independent bins."""
+    """Gain of ln likelihood by a coherence over `bins` independent bins."""
     found: Array = -bins * np.log1p(-np.minimum(np.abs(coherence) ** 2, 1.0 - 1e-12))
     return found
 
@@ -205,7 +206,7 @@ def look(pair: Pair, found: Common, other: str) -> Look:
 
 def carried_over(u: Array, v: Array, dt: float, split: int, estimate: Mapping[str, Any]) -> tuple[float, float]:
     """Joint log score a sample of the whitened innovations from `split` on, with the correlation before it, less the
-    sum of the single ones; and its standard deviation."""
+    sum of the single scores; and its standard deviation."""
     before, after = pair_of(u[:split], v[:split], dt), pair_of(u[split:], v[split:], dt)
     band = estimate.get("band_hz")
 
@@ -227,7 +228,7 @@ def carried_over(u: Array, v: Array, dt: float, split: int, estimate: Mapping[st
 
 
 def by_frequency(pair: Pair) -> tuple[Array, Array, Array]:
-    """By band: frequency, Hz; correlation in phase; and the standard deviation of chance."""
+    """Frequency, Hz, of each band; correlation in phase; and the standard deviation of chance."""
     cross, _, bins = pair.sums
     hz = np.sqrt(pair.edges[:-1] * pair.edges[1:].astype(float)) / (pair.u.size * pair.dt)
     free = np.maximum(bins * pair.present / pair.u.size, 0.5)
@@ -273,7 +274,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
 
 
 def _of_band(band: Look, shared: Look, pair: Pair) -> bool:
-    """Whether the noise that two axes share is that of a band of one of them. The evidence for the band is then
+    """Whether the noise that two axes share is that of a band of either axis. The evidence for the band is then
     evidence for the source as well: over a model that has neither."""
     if band.cause != "periodic" or "width_hz" not in band.estimate or "band_hz" not in shared.estimate:
         return False
@@ -285,7 +286,7 @@ def _of_band(band: Look, shared: Look, pair: Pair) -> bool:
 
 def _accounted(name: str, axis: Diagnosed, found: Mapping[str, Diagnosed]) -> None:
     """Drop a dependence on another axis that no form explains where that axis leaks or shares a source. Seen from the
-    axis that leaks, its coefficient differs from one frequency to the next."""
+    axis that leaks, its coefficient differs from frequency to frequency."""
     known = {str(finding.look.estimate["other"]) for finding in axis.findings if "other" in finding.look.estimate}
     for other, two in found.items():
         if any(finding.look.estimate.get("other") == name for finding in two.findings):
@@ -298,8 +299,8 @@ def _leaks(
 ) -> None:
     """Judge whether an axis that follows another shares a source with it instead.
 
-    A leak has one coefficient at all frequencies, the drift's included. A common source is in the noise alone. The one
-    that explains more stays, net of the searches: the best of many bands gains more than one coefficient does, and a
+    A leak has the same coefficient at all frequencies, the drift's included. A common source is in the noise alone.
+    Whichever explains more stays, net of the searches: the best of many bands gains more than a coefficient does. A
     source that leaks into another axis as well is no longer looked for."""
     for finding in [finding for finding in axis.findings if finding.look.cause == "cross_axis"]:
         other = str(finding.look.estimate["other"])
@@ -322,7 +323,7 @@ def _leaks(
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:
-    """The correlation of white noise with one of the other axes."""
+    """The correlation of white noise with another axis."""
     pairs = len(record.axes) * (len(record.axes) - 1) // 2
     if not pairs:
         return None

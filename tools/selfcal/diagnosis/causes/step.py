@@ -13,7 +13,7 @@ from selfcal.likelihood import columns, edges
 from selfcal.likelihood.edges import KEYS, scan
 from selfcal.likelihood.state import SCREEN, FittedColumn, Look, State
 
-#: Jumps of two axes so close to each other, s, are one event.
+#: Time between jumps of two axes, s, below which they are the same event.
 ONE_EVENT_S = 30.0
 
 
@@ -37,7 +37,7 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
 
 
 def alike(a: Look, b: Look) -> bool:
-    """Whether each edge of one lies near the other's."""
+    """Whether each edge of a look lies near the other look's."""
     return (
         a.when is not None
         and b.when is not None
@@ -46,19 +46,19 @@ def alike(a: Look, b: Look) -> bool:
 
 
 def at_jump(look: Look, axes: Collection[str], jumps: Sequence[float]) -> bool:
-    """Whether each end of it lies at a jump of the hidden quantity."""
+    """Whether each end of a look lies at a jump of the hidden quantity."""
     times = () if look.when is None else look.when
     return bool(times) and all(any(abs(time - jump) < ONE_EVENT_S for jump in jumps) for time in times)
 
 
 def least(state: State, record: Record) -> dict[str, tuple[float, str]]:
-    """One in the middle of the record."""
+    """A step in the middle of the record."""
     places = (record.present.size // 2,)
     return columns.least(state, edges.shape(state, "step", places, scan(state.series, state.best)), "amplitude")
 
 
 def entry(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
-    """Its times are those of the whole recording."""
+    """The entry with times of the whole recording."""
     keys = [key for of in KEYS.values() for key in of if key in entry]
     times = [float(entry[key]) for key in keys]
     if look is not None:

@@ -1,4 +1,4 @@
-"""The readings stop at one value for a while. readings.py finds the stretches."""
+"""The readings stop at a value for a while. readings.py finds the stretches."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, count_ke
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:
-    """Each interval a tenth of its piece of the record."""
+    """Hold a reading in each interval, a tenth of its piece of the record."""
     piece = row.size // keys["intervals"]
     for k in range(keys["intervals"]):
         start = k * piece + int(random.uniform() * 0.8 * piece)

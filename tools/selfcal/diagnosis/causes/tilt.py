@@ -26,13 +26,13 @@ GRAVITY_SHARE_MOST = 0.1
 #: Share of the step's information that two angles explain, at least.
 EXPLAINED_LEAST = 0.9
 #: Time about the event over which the gyroscopes' rates are summed up, s, and standard deviations beyond which their
-#: angle tells the sense of the turn.
+#: angle shows the sense of the turn.
 ABOUT_S, SENSE_SDS = 3.0, 3.0
 
 
 def settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
-    """Name the steps of one event a turn of the sensor, where their sizes beside all other findings are one. A step of
-    one accelerometer may be a turn about one axis: gravity moves on the others by its square alone."""
+    """Name the steps of an event a turn of the sensor, where their sizes fit a turn, all other findings in the model. A
+    step of a single accelerometer may be a turn about an axis: gravity moves on the others by its square alone."""
     states = {**record.axes, **{name: axis.state for name, axis in found.items()}}
     events: dict[int | str, dict[str, int]] = {}
     for name, axis in found.items():
@@ -55,7 +55,7 @@ def settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
 
 
 def _turn_of(looks: Mapping[str, Look], states: Mapping[str, State]) -> tuple[dict[str, Any], bool] | None:
-    """The angles of the turn that explains the steps of one event, and whether the gyroscopes show it; None: none."""
+    """The angles of the turn that explains the steps of an event, and whether the gyroscopes show it; None: no turn."""
     force = _specific_force(states)
     if force is None or not looks.keys() <= force.keys():
         return None
@@ -66,7 +66,7 @@ def _turn_of(looks: Mapping[str, Look], states: Mapping[str, State]) -> tuple[di
         if name in looks:
             amplitude, scale = looks[name].estimate["amplitude"], force[name][1]
             size[k], information[k] = amplitude["median"] * scale, (amplitude["sd"] * scale) ** -2.0
-    # A turn keeps the length of f. What lies along f beyond that is none.
+    # A turn keeps the length of f. A step along f beyond that is no turn.
     across = size - f * float(f @ size + 0.5 * size @ size) / float(f @ f)
     along = (size - across) ** 2
     if float(information @ along) > (1.0 - EXPLAINED_LEAST) * float(information @ size**2):
@@ -89,7 +89,7 @@ def _turn_of(looks: Mapping[str, Look], states: Mapping[str, State]) -> tuple[di
 
 
 def _specific_force(states: Mapping[str, State]) -> dict[str, tuple[float, float]] | None:
-    """By accelerometer its level and the factor of its unit, m/s^2; None: not three that feel gravity alone."""
+    """Level of each accelerometer and the factor of its unit, m/s^2; None: not three that feel gravity alone."""
     found = {}
     for name, state in sorted(states.items()):
         try:

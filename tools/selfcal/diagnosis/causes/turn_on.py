@@ -20,22 +20,22 @@ from selfcal.likelihood.state import NET_LEAST, FittedColumn, Look, State, log_n
 
 #: The fastest time constant looked for, samples.
 FASTEST = 5.0
-#: Two time constants of one transient lie this factor apart at least.
+#: Least factor between two time constants of a transient.
 TAUS_APART = 4.0
-#: Price of the search over a time constant beside its degree of freedom.
+#: Price of the search over a time constant, besides its degree of freedom.
 LN_LOOKS = 0.4
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """The best time constant, or the best two where a single one shows settling and both are clearly more likely."""
+    """The best time constant, or the best two, if a single constant shows settling and both are clearly likelier."""
     tau = _grid(record)
     pairs = (_shape(state, record, two) for two in combinations(tau, 2) if two[1] > 0.999 * TAUS_APART * two[0])
     return columns.looks(state, "turn_on", [_shape(state, record, [constant]) for constant in tau], pairs)
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
-    """The look at a settling whose time constant, s, is known, and the sd of the logarithm of that. Where the axis
-    alone knows better, as it does two time constants, its own look."""
+    """The look at a settling with a known time constant, s, and the sd of its logarithm. Where the axis alone knows
+    better, as it does two time constants, its own look."""
     tau_s, sd = theta
     known = {"tau_s": log_normal(math.log(tau_s), sd, "s")}
     found = columns.located(state, "turn_on", _shape(state, record, [tau_s]), known)
@@ -44,7 +44,7 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
 
 
 def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
-    """Of one time constant, or of two, the faster one first: that is a share of the slower one."""
+    """Shape of one time constant, or of two, the faster first: the faster is a share of the slower."""
     rows = _decays(_time(record), np.asarray(tau))
     ends = ["", "_2"][: len(tau)]
     low, high = _range(record)
@@ -76,7 +76,7 @@ def _grid(record: Record) -> Array:
 
 
 def _range(record: Record) -> tuple[float, float]:
-    """A faster one is over before the record begins."""
+    """Least and most time constant, s: a faster settling is over before the record begins."""
     fastest = max(FASTEST / record.rate_hz, float(_time(record)[0]) / FASTEST)
     return fastest, max(2.0 * fastest, record.present.size / record.rate_hz)
 
@@ -93,14 +93,14 @@ def _decays(t: Array, tau: Array) -> Array:
 
 
 def _alike(a: Look, b: Look) -> bool:
-    """Whether the time constants may be one."""
+    """Whether the time constants may be equal."""
     one, two = (look.estimate["tau_s"] for look in (a, b))
     return bool(one["q05"] <= two["q95"] and two["q05"] <= one["q95"])
 
 
 def _trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
-    """With the time constants that the first samples alone show. What their scored successors gain is the noise model
-    that is left of the first ones: the transient itself is mostly over."""
+    """The state with the time constants that the first samples alone show. The scored samples gain by the noise model
+    that the first samples then leave: the transient itself is mostly over."""
     known = {regressor.name for regressor in before.regressors}
     half = before.first(split)
     own_record = replace(record, present=record.present[:split])
@@ -117,12 +117,12 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
-    """One of a tenth of the record."""
+    """A time constant of a tenth of the record."""
     return columns.least(state, _shape(state, record, [0.1 * record.present.size / record.rate_hz]), "amplitude")
 
 
 def _entry(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
-    """Of the two time constants of a look the nearer one."""
+    """The entry with the nearer of a look's two time constants."""
     known = {} if look is None else medians(look)
     times = [known[key] for key in ("tau_s", "tau_2_s") if key in known] or [float(entry["tau_s"])]
     return {**entry, "tau_s": digits(min(times, key=lambda time: abs(math.log(time / float(entry["tau_s"])))))}

@@ -1,6 +1,6 @@
-"""Two levels (popcorn): the bias stays at one of two levels for a while, then jumps to the other.
+"""Two levels (popcorn): the bias stays at one level for a while, then jumps to the other.
 
-A switching filter on block means: a random walk beside two hypotheses of the level, merged into one Gaussian after each
+A switching filter on block means: a random walk with two hypotheses of the level, merged into a Gaussian after each
 sample (a generalized pseudo-Bayesian filter of order 1). It runs for many parameters at once.
 """
 
@@ -23,16 +23,16 @@ from selfcal.likelihood.columns import LN_SLOW, SMALLER, top
 from selfcal.likelihood.edges import scan, steady
 from selfcal.likelihood.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
 
-#: Tried first: amplitudes over the white noise of a block, dwell times in blocks.
+#: Amplitudes over the white noise of a block, and dwell times in blocks, that are tried first.
 AMPLITUDES = (0.5, 0.75, 1.1, 1.6, 2.4, 3.6)
 DWELLS = (15.0, 50.0, 150.0, 450.0)
-#: The drift without levels, so that both are judged by one filter: ln of walk and white noise over the fitted ones.
+#: ln of walk and white noise over the fitted values, for the drift without levels: the same filter judges both.
 WALKS, WHITES = np.linspace(-2.0, 0.5, 11), np.linspace(-0.03, 0.03, 4)
 #: Places of a dwell time's posterior.
 QUANTILES = 64
-#: Fewer jumps are steps, or a pulse.
+#: Least jumps between two levels: fewer are steps, or a pulse.
 JUMPS_LEAST = 4
-#: Price of the search beside three degrees of freedom.
+#: Price of the search, besides three degrees of freedom.
 LN_LOOKS = 2.0 + LN_SLOW
 #: Limits of a probability, and the largest exponent, of a double.
 PROBABILITY_LEAST, LN_MOST = float(np.finfo(float).eps), math.log(np.finfo(float).max)
@@ -56,7 +56,7 @@ def switching(y: Array, theta: Array) -> tuple[Array, Array]:
             S = spread[k] = P + R
             gain = P / S
             e = apart[k] = value - x
-            # The likelihood of the upper level over that of the lower one.
+            # The likelihood of the upper level over that of the lower level.
             ratio = np.exp(np.minimum(A * e / S, LN_MOST))
             upper = w * ratio
             both = odds[k] = upper - w + 1.0
@@ -78,7 +78,7 @@ def looks(state: State, record: Record) -> list[Look]:
     # Two levels that jump often have the correlation of a Gauss-Markov drift, which leaves no jump to see.
     if scan(state.series, state.best).gain.max() < SCREEN + 2.0 and _law(state) < SCREEN:
         return []
-    series, block = replace(state, y=steady(state)).means()  # the filter knows a walk and white noise of one level
+    series, block = replace(state, y=steady(state)).means()  # the filter knows a walk and white noise of a fixed size
     y = series.y
     walk = next(fit for fit in state.fits if fit.terms.walk)
     ln_rho = walk.of_means(block, 0.0)[walk.terms.names.index("ln_rho")]
@@ -134,9 +134,8 @@ def looks(state: State, record: Record) -> list[Look]:
 
 
 def _shaken(state: State, record: Record, levels: Array) -> bool:
-    """Whether another axis vibrates more at one of the levels [n] than at the other, and the bias follows that axis'
-    variance: the levels are then those of a machine that is switched. They fit better than a measured variance, which
-    scatters."""
+    """Whether another axis vibrates differently at the two `levels` [n], and the bias follows that axis' variance: the
+    levels are then those of a machine that is switched. They fit better than a measured variance, which scatters."""
     variances = record.variances(state.axis)
     louder = set()
     for name, variance in variances.items():
@@ -155,14 +154,14 @@ def _shaken(state: State, record: Record, levels: Array) -> bool:
 
 
 def _without(ln_rho: float, ln_sigma: float) -> Array:
-    """Walks beside one level [g, 5], for the same filter."""
+    """Walks with a single level [g, 5], for the same filter."""
     walks, whites = (axis.ravel() for axis in np.meshgrid(WALKS, WHITES))
     none, dwell = np.full(walks.size, math.log(PROBABILITY_LEAST) + ln_sigma), np.full(walks.size, math.log(100.0))
     return np.column_stack([none, dwell, dwell, ln_rho + walks, ln_sigma + whites])
 
 
 def _law(state: State) -> float:
-    """How far the walk is behind the best drift, nats: two levels are beside a walk."""
+    """How far the walk is behind the best drift, nats: two levels come with a walk."""
     walk = next(fit for fit in state.fits if fit.terms.walk)
     return max(0.0, state.best.ln_likelihood - walk.ln_likelihood)
 
@@ -211,7 +210,7 @@ def _smoothed(y: Array, theta: Array) -> Array:
 
 
 def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
-    """From one level to the other after dwell times drawn from exponentials."""
+    """Levels that alternate after dwell times drawn from exponentials."""
     t = channels.time_s
     upper, end = bool(channels.random.integers(2)), 0.0
     values = np.empty(t.size)

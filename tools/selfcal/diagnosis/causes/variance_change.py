@@ -43,16 +43,16 @@ from selfcal.readings.moves import LEVEL
 
 #: A change of the noise keeps this many samples, and this share of the record, from either end.
 EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0
-#: ln of the variance over that of the rest, at most: readings that are so much quieter have no noise, they repeat.
+#: Largest ln of the variance over that of the rest: readings that are this much quieter have no noise, they repeat.
 LOUDEST = math.log(1e3)
 #: Places among which the two ends of a stretch are looked for first.
 END_PLACES = 120
-#: A squared innovation counts as so many variances at most: one wild sample is no change of the noise.
+#: Most variances that a squared innovation counts as: a wild sample is no change of the noise.
 CLIP_AT = 12.0
-#: Steps of the search for a slope, and the largest one in standard deviations of the channel.
+#: Steps of the search for a slope, and the largest step in standard deviations of the channel.
 SLOPE_STEPS, SLOPE_MOST = 30, 1.0
-#: Samples that the level of another axis leaves out: the one that is judged, and two on either side. Where one axis is
-#: in the other, at once or a sample late, or both share noise, a square of one is in the variance of the other.
+#: Samples that the level of another axis leaves out: the judged sample, and two on either side. If axes leak, at once
+#: or a sample late, or share noise, a square of the judged axis is in the variance of the other.
 OWN_SAMPLES = 5
 #: Shares of the record that the channel lies below at the quiet and at the loud end of `ratio`.
 ENDS = (0.05, 0.95)
@@ -60,8 +60,8 @@ ENDS = (0.05, 0.95)
 
 @dataclass(frozen=True)
 class Power:
-    """Squared innovations of axes on one grid: sums before each sample, `total` [m, n + 1], of so many that are there,
-    `count` [m, n + 1]. `present`: samples that an axis has. A level may begin or end at each but the first."""
+    """Squared innovations of axes on a common grid: sums before each sample, `total` [m, n + 1], and the samples in
+    them, `count` [m, n + 1]. `present`: samples that an axis has. A level may begin or end at each but the first."""
 
     total: Array
     count: Array
@@ -69,8 +69,8 @@ class Power:
 
     @classmethod
     def of(cls, whitened: Array) -> Power:
-        """Of residual innovations [m, n] of standard deviation 1, NaN where they are missing. What a jump of the bias
-        leaves is no noise: they are taken about their mean nearby, less which white noise has a little less power."""
+        """`Power` of residual innovations [m, n] of standard deviation 1, NaN where they are missing. The trace of a
+        jump is no noise: they are taken about their mean nearby, less which white noise has a little less power."""
         there = np.isfinite(whitened)
         known, near = (uniform_filter1d(rows, LEVEL, axis=1) for rows in (there.astype(float), np.nan_to_num(whitened)))
         apart = (whitened - near / np.maximum(known, 1e-9)) / np.sqrt(1.0 - 1.0 / LEVEL)
@@ -84,7 +84,7 @@ class Power:
         return len(self.total.T) - 1
 
     def levels(self, begin: Rows | int, end: Rows | int) -> tuple[Array, Array]:
-        """Variances, and the samples that they rest on, in stretches and beside them: [2, m, k] each."""
+        """Variances, and the samples that they rest on, in stretches and outside them: [2, m, k] each."""
         first, last = np.broadcast_arrays(np.atleast_1d(begin), np.atleast_1d(end))
         inside = [rows[:, last] - rows[:, first] for rows in (self.total, self.count)]
         square, n = (
@@ -103,7 +103,7 @@ class Power:
         return np.where(np.minimum(np.minimum(before, after), n[0]) >= least, found, 0.0)
 
     def wide(self, states: Sequence[State], begin: int, end: int) -> Array:
-        """Times [m] that the null is wider than of normal noise, by the kurtosis of the squares beside the levels of a
+        """Times [m] that the null is wider than of normal noise, by the kurtosis of the squares over the levels of a
         stretch."""
         level, inside = self.levels(begin, end)[0], raised(self.n, begin, end) > 0.0
         squares = np.diff(self.total) / np.where(inside, level[0], level[1])
@@ -121,7 +121,7 @@ class Power:
         return [self.moved(int(places[0]), self.n), self.moved(int(first[at]), int(last[at]))]
 
     def moved(self, begin: int, end: int) -> tuple[int, int]:
-        """Each end of a stretch in turn at its likeliest place."""
+        """The stretch with each end in turn at its likeliest place."""
         places = self.present[1:]
         for _ in range(1 if end == self.n else 2):
             before = places[places < end]
@@ -189,7 +189,7 @@ def filtered(states: Sequence[State], power: Power, begin: int, end: int) -> Pow
 
 
 def noisy_stretches(states: Sequence[State]) -> Iterator[tuple[Power, tuple[int, int]]]:
-    """The likeliest change that lasts, and the likeliest stretch: the power of the axes beside it, and its ends."""
+    """The likeliest change that lasts, and the likeliest stretch: the power of the axes with it, and its ends."""
     first = Power.of(np.array([state.whitened for state in states]))
     for ends in first.best():
         power = filtered(states, first, *ends)
@@ -214,7 +214,7 @@ def _look(state: State, level: Level) -> Look:
 
 
 def _of_time(state: State, record: Record, begin: int, end: int) -> Level:
-    """A level from a sample on and before another one."""
+    """A level from sample `begin` on and before sample `end`."""
     n = state.y.size
 
     def likely(gain: Array, at: Rows, wide: float) -> tuple[Array, Rows]:
@@ -224,13 +224,13 @@ def _of_time(state: State, record: Record, begin: int, end: int) -> Level:
         return weight[held], at[held]
 
     def time(present: Rows, weight: Array, at: Rows) -> dict[str, Any]:
-        """When an end is: between the last reading before a place and the first one after it."""
+        """Time of an end: between the last reading before a place and the first after it."""
         last = record.time_s[present[np.searchsorted(present, at) - 1]]
         apart = record.time_s[at] - last
         return mixture(weight * apart, last + 0.5 * apart, apart / math.sqrt(12.0), "s")
 
     def told(slope: float, sd: float, wide: float) -> dict[str, Any]:
-        """Over every place of each end, the other one held."""
+        """The estimate over every place of each end, the other end held."""
         power = filtered([state], Power.of(state.whitened[None]), begin, end)
         present = power.present
         before, after = present[1:][present[1:] < end], present[present > begin]
@@ -331,7 +331,7 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
 
 
 def _extend(at: Extension) -> None:
-    if at.finding.look.when and not at.tree.get("regressors"):  # a module handles changes beside no column
+    if at.finding.look.when and not at.tree.get("regressors"):  # a module with columns handles no changes
         add_handling(at.tree, "variance_changes", True)
 
 

@@ -20,12 +20,12 @@ from selfcal.model.forms import variance_of
 
 #: Widths of the means of a variance, s.
 WIDTHS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
-#: Differences that a variance is taken from at least: one alone scatters by 1.7 times itself.
+#: Least differences that a variance is taken from: a single difference scatters by 1.7 times itself.
 ENOUGH = 8
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """One look for every other axis whose variance is known."""
+    """A look for every other axis whose variance is known."""
     others = {name: values for name, values in record.variances(state.axis).items() if np.ptp(values) > 0.0}
     widths = tuple(width for width in WIDTHS_S if width * record.recorded_hz >= ENOUGH) or WIDTHS_S[-1:]
     return channel_looks.look(

@@ -1,8 +1,8 @@
-"""Betaflight's blackbox (.bbl, .bfl): the frames of a log as one table, by the description of its own headers.
+"""Betaflight's blackbox (.bbl, .bfl): the frames of a log as a table, by the description of its own headers.
 
-A file may hold several logs, one an arming: each is a source. Rates are in deg/s by the header `gyro_scale`, ten times
-finer where `blackbox_high_resolution` is on; accelerations are counts of `acc_1G`. A frame that is damaged is left out,
-and those that are built on it, until the next one that stands for itself.
+A file may hold several logs, a log for each arming: each is a source. Rates are in deg/s by the header `gyro_scale`,
+ten times finer where `blackbox_high_resolution` is on; accelerations are counts of `acc_1G`. A damaged frame is left
+out, and the frames built on it, until the next self-contained frame.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def _sign(value: int, bits: int) -> int:
 
 
 def _three(data: _Bytes, wide: Sequence[Sequence[int]]) -> list[int]:
-    """Three numbers of one tag: of the bits `wide` by the tag's number 0 to 2, or of 1 to 4 bytes each."""
+    """Three numbers of a tag: of the bits `wide` by the tag's number 0 to 2, or of 1 to 4 bytes each."""
     tag = data.byte()
     kind = tag >> 6
     if kind == len(wide):
@@ -92,7 +92,7 @@ def _three(data: _Bytes, wide: Sequence[Sequence[int]]) -> list[int]:
 
 
 def _four(data: _Bytes) -> list[int]:
-    """Four numbers of one tag, of 0, 4, 8 or 16 bits each, packed by half bytes."""
+    """Four numbers of a tag, of 0, 4, 8 or 16 bits each, packed by half bytes."""
     tag = data.byte()
     held = -1
     numbers = []
@@ -147,7 +147,7 @@ def _values(data: _Bytes, encodings: Sequence[int]) -> list[int]:
 
 
 class _Log:
-    """One log of a file."""
+    """A log of a file."""
 
     def __init__(self, data: bytes) -> None:
         """Read the headers. Raises ValueError where they describe no frames."""
@@ -187,8 +187,8 @@ class _Log:
         return int(first) if first.lstrip("-").isdigit() else otherwise
 
     def frames(self) -> Iterator[list[int]]:
-        """The values of the main frames, in order. What lies between a damaged one and the next that stands for itself
-        counts as `damaged`."""
+        """The values of the main frames, in order. Data from a damaged frame to the next self-contained frame counts as
+        `damaged`."""
         data, history = self.data, list[list[int]]()
         lost, size = -1, len(data.data)
         while data.at < size:
@@ -207,7 +207,7 @@ class _Log:
                 if kind not in b"IP" or (kind in b"P" and not history):
                     continue
                 values = self._predicted(values, predictors, history if kind in b"P" else [])
-                # Of frames 10 s apart one is damaged.
+                # Of frames 10 s apart, or back in time, one is damaged.
                 if history and not 0 < values[self.time] - history[-1][self.time] < 10_000_000:
                     raise _Damaged
             except (_Damaged, IndexError):
@@ -310,7 +310,7 @@ def _table(log: _Log, source: str) -> Table | None:
 
 
 def _gyro_size(text: str) -> float:
-    """Degrees a second of one count, of the bits of a float32: in older logs radians a microsecond."""
+    """Degrees a second of a count, of the bits of a float32: in older logs radians a microsecond."""
     try:
         (size,) = struct.unpack(">f", bytes.fromhex(text.strip().removeprefix("0x").rjust(8, "0")))
     except (ValueError, struct.error):

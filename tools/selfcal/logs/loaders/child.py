@@ -1,7 +1,7 @@
 """A binary file is read in a child process, within bounds of time and memory.
 
-The parent gets JSON and the bytes of arrays by a pipe, or one line that says why there are none. The reader may end by
-a signal, or never: the parent goes on.
+The parent gets JSON and the bytes of arrays by a pipe, or a line that says why not. The reader may end by a signal, or
+never: the parent goes on.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def answer(module: str, path: Path, hints: Hints, to: int) -> None:
     most = min(16 << 30, (3 << 30) + 40 * _bytes(path))
     _bound(resource.RLIMIT_AS, most, most)
     _bound(resource.RLIMIT_CPU, seconds, seconds + 5)
-    # What it unpacks into files: each part of a folder, but for its index, into one.
+    # Files that it unpacks: a file for each part of a folder, but for its index.
     most = max(MOST_UNPACKED_SMALL, MOST_GROWTH * _bytes(path)) // max(1, len(parts_of(path)) - path.is_dir())
     _bound(resource.RLIMIT_FSIZE, most, most)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -159,7 +159,7 @@ def answer(module: str, path: Path, hints: Hints, to: int) -> None:
 
 
 def _bound(kind: int, soft: int, hard: int) -> None:
-    """Set a limit of this process, or keep a lower one that it has."""
+    """Set a limit of this process, or keep a lower limit that it has."""
     given = resource.getrlimit(kind)[1]
     most = hard if given == resource.RLIM_INFINITY else min(hard, given)
     resource.setrlimit(kind, (min(soft, most), most))

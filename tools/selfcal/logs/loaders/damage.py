@@ -32,7 +32,7 @@ class Damaged:
 
     @property
     def words(self) -> str:
-        """One line."""
+        """The damage in a line."""
         share = f"{100.0 * self.bytes / max(self.whole, 1):.2g} %"
         more = f"{self.messages:,} message{'s' if self.messages > 1 else ''} or more"
         return f"{share} of the file could not be read: {more}"
@@ -66,10 +66,10 @@ def mapped(path: Path) -> Iterator[Bytes]:
 def walk(
     data: Bytes, at: int, end_of: Callable[[int], int], *, checked: bool = False
 ) -> Iterator[tuple[int, int, bool]]:
-    """Messages from a place on: begin, end, whether it is sound. What is not is a stretch up to the next sound one.
+    """Messages from a place on: begin, end, whether it is sound. Unsound: a stretch up to a sound message.
 
-    `end_of`: the end of the message that begins at a place, 0 for none. `checked`: it has looked at a checksum. Without
-    one a message after which none follows is damaged where others begin within it.
+    `end_of`: the end of the message that begins at a place, 0 for none. `checked`: `end_of` looks at a checksum. Else a
+    message that no message follows is damaged where others begin within it.
     """
     size = len(data)
 
@@ -81,7 +81,7 @@ def walk(
                 break
         return message > 0
 
-    held: tuple[int, int] | None = None  # sound, if the next one is
+    held: tuple[int, int] | None = None  # sound, if the next message is
     while at < size:
         end = end_of(at)
         if end:

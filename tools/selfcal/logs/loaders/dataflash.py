@@ -45,7 +45,7 @@ _HEAD, _FMT = b"\xa3\x95", 0x80
 
 
 class _Rows:
-    """Values of one source, a column each."""
+    """Values of a source, a column for each heading."""
 
     def __init__(self, headings: list[str]) -> None:
         self.headings, self.values = headings, array("d")
@@ -78,7 +78,7 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _ends(data: Bytes) -> Callable[[int], int]:
-    """Where the message of a DataFlash log at a place ends. A page's rest that was never written counts as one.
+    """Where the message of a DataFlash log at a place ends. A page's rest that was never written counts as a message.
 
     A message is two bytes, its kind, and what the message FMT of its kind says. Source: ArduPilot's LogStructure.h.
     """
@@ -165,7 +165,7 @@ def _fits(crc: int, stated: bytes) -> bool:
 
 
 def _tlog(data: Bytes, lost: list[Damaged]) -> Iterator[tuple[str, str, list[str], list[float]]]:
-    """The same of a ground station's log. What is damaged joins `lost`.
+    """Like `_bin`, for a ground station's log. Damage joins `lost`.
 
     A message is a stamp of 8 bytes and a frame of MAVLink, which has a checksum.
     """

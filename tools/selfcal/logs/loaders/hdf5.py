@@ -1,4 +1,4 @@
-"""HDF5, and MATLAB's format 7.3, by h5py: a table a group, of the datasets of one length.
+"""HDF5, and MATLAB's format 7.3, by h5py: a table for each group and length of its datasets.
 
 A column has the dataset's attribute `unit` or `units`. Columns of a matrix NAME are NAME:1, NAME:2, ...; fields of a
 compound dataset are columns. A text `meta` is JSON, as in an npz.

@@ -26,7 +26,7 @@ RECEIVED = "received"
 
 @dataclass(frozen=True)
 class Meaning:
-    """A column: its name here, its unit where the heading or the program states one, and the units of one count."""
+    """A column: its name here, its unit where the heading or the program states one, and the units of a count."""
 
     name: str
     unit: str | None = None
@@ -37,7 +37,7 @@ class Meaning:
 
 @dataclass(frozen=True)
 class Sensor:
-    """The columns of one sensor in a table, by heading. `source` names it among others, empty where it is alone."""
+    """The columns of a sensor in a table, by heading. `source` names it among others, empty where it is alone."""
 
     source: str
     meant: Mapping[str, Meaning]
@@ -141,7 +141,7 @@ FORMS = (
     # Sensor Logger; the values without gravity, `Accelerometer`, are an estimate
     _Form(_AXIS, "", (("time", "ns"),), file="gyroscope", needs="seconds_elapsed"),
     _Form("", _AXIS, (("time", "ns"),), file="accel", needs="seconds_elapsed"),
-    # phyphox: one table, or one a sensor
+    # phyphox: a table, or a table for each sensor
     _Form(rf"Gyroscope {_AXIS}", rf"(?:Acceleration|Accelerometer) {_AXIS}", (("Time", "s"),)),
     _Form(_AXIS, "", (("Time", "s"),), file="gyroscope"),
     _Form("", _AXIS, (("Time", "s"),), file="accel"),
@@ -199,12 +199,12 @@ def sensors_of(
 
 
 def number_of(keys: Sequence[str]) -> str | None:
-    """The heading of the column that numbers the sensors, where there is one."""
+    """The heading of the column that numbers the sensors, if any."""
     return next((key for key in keys if split(key)[0].lower() in _NUMBERS), None)
 
 
 def sides_of(keys: Iterable[str]) -> Sensor | None:
-    """The temperature, with its time, of a table without axes; None without one."""
+    """The temperature, with its time, of a table without axes; None without a temperature."""
     form = FORMS[-1]
     listed = list(keys)
     meant = _temperature(form, listed, "")
@@ -273,7 +273,7 @@ def _axes(form: _Form, keys: Sequence[str]) -> Iterator[tuple[str, str, re.Match
 
 
 def _kind(unit: str | None, kinds: Sequence[tuple[str, str]] = (("g", "rad/s"), ("a", "m/s^2"))) -> str | None:
-    """`g` for a unit of a rate of turn, `a` for one of an acceleration, None for others. `kinds`: names of units."""
+    """`g` for a unit of a rate of turn, `a` for a unit of an acceleration, None for others. `kinds`: names of units."""
     name = units.plain(unit) if unit is not None else units.LSB
     if name == units.LSB or not units.known(name):
         return None
@@ -281,7 +281,7 @@ def _kind(unit: str | None, kinds: Sequence[tuple[str, str]] = (("g", "rad/s"), 
 
 
 def _fits(unit: str | None) -> bool:
-    """Whether an axis may state this unit: a rate's, an acceleration's, counts, or one that nobody knows."""
+    """Whether an axis may state this unit: a rate's, an acceleration's, counts, or an unknown unit."""
     return (
         _kind(unit) is not None or unit is None or units.plain(unit) == units.LSB or not units.known(units.plain(unit))
     )
@@ -311,7 +311,7 @@ def _in_two(keys: Sequence[str], source: str) -> dict[str, Meaning]:
 
 
 def _temperature(form: _Form, keys: Sequence[str], source: str) -> dict[str, Meaning]:
-    """The temperature of a source, else the only one that there is: by its name, else by its unit."""
+    """The temperature of a source, else the only temperature: by its name, else by its unit."""
     matches = [
         ((match.groupdict().get("source") or "").strip("/. "), key, stated)
         for key, match, stated in _matching(form.temperature, keys)
@@ -323,7 +323,7 @@ def _temperature(form: _Form, keys: Sequence[str], source: str) -> dict[str, Mea
 
 
 def _matching(pattern: str | tuple[str, ...], keys: Sequence[str]) -> Iterator[tuple[str, re.Match[str], str | None]]:
-    """Heading, match and the unit that it states, of the headings that one of the patterns fits."""
+    """Heading, match and the unit that it states, of the headings that any pattern fits."""
     patterns = [choice for choice in ([pattern] if isinstance(pattern, str) else pattern) if choice]
     for key in keys if patterns else ():
         match, unit = _first(patterns, key), None

@@ -79,7 +79,7 @@ def _mat5(data: memoryview, order: str) -> _Variables:
 
 
 def _array(body: memoryview, order: str) -> _Variables:
-    """The variable of an array's element, if it is one of numbers, or `meta`."""
+    """The variable of an array's element, if it holds numbers, or `meta`."""
     flags, behind = _element(body, 0, order)[1:]
     flag = struct.unpack_from(f"{order}I", flags)[0]
     of = flag & 0xFF
@@ -104,7 +104,7 @@ def _array(body: memoryview, order: str) -> _Variables:
 
 
 def _element(data: memoryview, begin: int, order: str) -> tuple[int, memoryview, int]:
-    """Kind and content of the element at a place, and the place behind it. Small ones have both in eight bytes."""
+    """Kind and content of the element at a place, and the place behind it. Small elements have both in eight bytes."""
     kind = struct.unpack_from(f"{order}I", data, begin)[0]
     if kind >> 16:
         return kind & 0xFFFF, _piece(data, begin + 4, kind >> 16), begin + 8

@@ -32,7 +32,7 @@ _SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nanosec", "nsecs"
 #: The first and the last bytes of a file; a record's kind and length; the kind of a chunk.
 _MAGIC, _HEAD = b"\x89MCAP0\r\n", struct.Struct("<BQ")
 _CHUNK = b"\x06"
-#: What of a message's fields is a sensor's by convention.
+#: Beginnings of a message's fields that are a sensor's by convention.
 _BY_CONVENTION = ("angular_velocity/", "linear_acceleration/")
 
 
@@ -44,7 +44,7 @@ class _Fields:
         self.stamps, self.published, self.stamped = array("q"), array("q"), True
 
     def take(self, message: Mapping[str, Any], published: int) -> None:
-        """One message, and when it was published, ns."""
+        """Take a message, and when it was published, ns."""
         fields = dict(_flat(message))
         stamp = _stamp(fields)
         if not self.names:
@@ -249,7 +249,7 @@ def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Mapping[str, Any]]:
 
 
 def _messages(message: Any) -> dict[str, Any]:
-    """The fields of a protobuf message, inner messages as mappings; repeated ones are left out."""
+    """The fields of a protobuf message, inner messages as mappings; repeated fields are left out."""
     fields: dict[str, Any] = {}
     for field in message.DESCRIPTOR.fields:
         value = getattr(message, field.name)

@@ -61,7 +61,7 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _formula(conversion: Any) -> str:
-    """The formula of a conversion, or of one within it; empty without one."""
+    """The formula of a conversion, or of a conversion within it; else empty."""
     from asammdf.blocks import v2_v3_constants, v4_blocks, v4_constants
 
     if conversion is None:

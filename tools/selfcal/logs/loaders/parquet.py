@@ -1,4 +1,4 @@
-"""Parquet by pyarrow: one table. A field's metadata `unit` or `units` is the column's unit; dates are stamps."""
+"""Parquet by pyarrow: a table. A field's metadata `unit` or `units` is the column's unit; dates are stamps."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def _r_pairs(node: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _r_text(node: Any) -> str:
-    """A symbol's or a string's text; empty without one."""
+    """A symbol's or a string's text; else empty."""
     while node is not None and node.info.type.name in ("REF", "SYM"):
         node = node.referenced_object if node.info.type.name == "REF" else node.value
     return node.value.decode("utf-8", "replace") if node is not None and isinstance(node.value, bytes) else ""
@@ -110,7 +110,7 @@ def _r_texts(node: Any) -> list[str]:
 
 
 def _r_add(path: Path, members: dict[str, Member], meta: dict[str, Any], name: str, node: Any) -> None:
-    """The columns of one object of the file."""
+    """The columns of an object of the file."""
     attributes = dict(_r_pairs(node.attributes))
     if node.info.type.name == "VEC":  # a list, or a data frame
         for called, value in zip(_r_texts(attributes.get("names")), node.value, strict=False):

@@ -1,7 +1,7 @@
 """ROS 1 bags and ROS 2 bags by rosbags: `sensor_msgs/Imu` and `sensor_msgs/Temperature`, a table a topic.
 
 The stamps are those of the messages' headers, never the times at which the bag got them. Messages of these two types
-have one layout in every ROS, so that the definitions in a bag, which rosbags would make code of, are not used.
+have the same layout in every ROS. So the definitions in a bag, which rosbags would make code of, are not used.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Topic:
     """The messages of a topic: stamps, ns, and doubles."""
 
     def __init__(self, kind: str) -> None:
-        """`kind`: one of LAYOUTS."""
+        """`kind`: a key of LAYOUTS."""
         self.kind, self.stamps, self.values = kind, array("q"), array("d")
 
     def take(self, data: bytes, *, cdr: bool) -> None:
-        """One message, in CDR or in ROS 1's form. Raises struct.error and IndexError for one that is cut off."""
+        """Take a message, in CDR or in ROS 1's form. Raises struct.error and IndexError for a cut message."""
         order = ">" if cdr and not data[1] & 1 else "<"
         seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
         begin = 16 + length
@@ -102,7 +102,7 @@ def read(path: Path, _: Hints) -> list[Table]:
             step = f"sqlite3 {shlex.quote(str(part))} 'pragma wal_checkpoint(truncate)'"
             raise UserError(f"{path}: messages are in {part.name}-wal, which is not read: bring them in by {step}")
     names = "".join(map(str, parts))
-    if not first and set("%?#") & set(names):  # of a URI: rosbags makes one of a name as it is, and opens another file
+    if not first and set("%?#") & set(names):  # of a URI: rosbags makes a URI of the plain name, and opens another file
         raise UserError(f"{path}: rename it: a ROS 2 bag with '%', '?' or '#' in a name cannot be opened")
     topics: dict[tuple[str, str], Topic] = {}
     with (Reader1 if first else Reader2)(path) as bag:

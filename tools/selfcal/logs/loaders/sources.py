@@ -1,6 +1,6 @@
-"""Several sensors in one log: which of them is meant.
+"""Several sensors in a log: which of them is meant.
 
-Sensors without an axis in common are one IMU. Of those that have one, a sensor counts that reads five times oftener
+Sensors without a common axis make an IMU. Of sensors with a common axis, a sensor counts that reads five times oftener
 than each of the others: loggers thin out the rest. Otherwise the user chooses.
 """
 
@@ -15,11 +15,11 @@ from selfcal.base.errors import MOST_NAMED, UserError, few, printable, short
 
 @dataclass(frozen=True)
 class Share:
-    """One table's share in a source.
+    """A table's share in a source.
 
-    `axes`: none for a table of temperatures. `warm`: a temperature can be had alone. `span` finds the number of
-    readings, and their seconds. `read` reads it as `recording.py` has it: beside others or alone, the temperature only
-    or all.
+    `axes`: empty for a table of temperatures. `warm`: a temperature can be had alone. `span` finds the number of
+    readings, and their seconds. `read` reads it as `recording.py` has it: with others or alone, the temperature only or
+    all.
     """
 
     source: str
@@ -93,7 +93,7 @@ def _by_rate(
 
 
 def _nearest(kept: Sequence[str], sides: Sequence[str]) -> list[str]:
-    """The temperatures of the sensors: the only one, else the one whose name has the longest begin in common."""
+    """The temperatures of the sensors: the only name, else the name with the longest beginning in common."""
     if len(sides) == 1:
         return list(sides)
 

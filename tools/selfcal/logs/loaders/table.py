@@ -1,4 +1,4 @@
-"""A table of a file: columns by their headings, of one clock; and the bounds that readers of arrays share."""
+"""A table of a file: columns by their headings, of a clock; and the bounds that readers of arrays share."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class Table:
     notes: tuple[str, ...] = ()
     damaged: Damaged = SOUND
 
-    #: Of a text: its name, headings, the lines before them, their line in messages, and the cells of the first row.
+    #: A text's name, headings, the lines before them, their line in messages, and the cells of the first row.
     name: str = ""
     headings: Sequence[str] = ()
     before: Sequence[str] | None = None
@@ -156,8 +156,7 @@ def of_groups(
     notes: tuple[str, ...] = (),
     damaged: Damaged = SOUND,
 ) -> list[Table]:
-    """A table for the columns of each group and length: the longest has the group's name, others their length beside
-    it."""
+    """A table for the columns of each group and length: the longest has the group's name, others also their length."""
     longest = {group: max(size for of, size in columns if of == group) for group, _ in columns}
     return [
         of_arrays(group if size == longest[group] else f"{group}:{size}", arrays, meta, notes, damaged)

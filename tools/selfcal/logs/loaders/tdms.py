@@ -1,4 +1,4 @@
-"""LabVIEW's TDMS by nptdms: a table a group, of the channels of one length.
+"""LabVIEW's TDMS by nptdms: a table for each group and length of its channels.
 
 Units are those of the channels (`unit_string`). Without a channel of times a waveform's own increment is the clock.
 """

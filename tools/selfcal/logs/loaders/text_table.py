@@ -1,9 +1,9 @@
-"""Recordings that are text: columns separated by commas, semicolons, tabs or blanks, under one header line.
+"""Recordings that are text: columns separated by commas, semicolons, tabs or blanks, under a header line.
 
-The header is the first line with a heading that the caller knows and no number; lines before it are skipped. Without
-one it is the first line that is no comment, or, where numbers follow comments, the last comment, as `numpy.savetxt`
-writes it. Between semicolons, tabs or blanks a comma is a decimal sign. An empty cell is NaN. The text is read in
-blocks: no more of it than one is in memory.
+The header is the first line with a heading that the caller knows and no number; lines before it are skipped. Else it is
+the first line that is no comment, or, where numbers follow comments, the last comment, as `numpy.savetxt` writes it.
+Between semicolons, tabs or blanks a comma is a decimal sign. An empty cell is NaN. The text is read in blocks: at most
+one block is in memory.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ _COMMENT_OF_ROWS = "comment"
 #: Nothing but numbers and what separates them.
 _ROW = re.compile(r"[-+.,;\t \"eE\d]*\d[-+.,;\t \"eE\d]*", re.ASCII)
 _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*", re.ASCII)
-#: A number and its unit, in one cell.
+#: A number and its unit, in a cell.
 _WITH_UNIT = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)? ([^\W\d_][\w/^]{0,20})\s*", re.ASCII)
 _QUOTED = ' "'
-#: A number whose thousands commas separate: without a point one comma may be the decimal sign.
+#: A number whose thousands commas separate: without a point a single comma may be the decimal sign.
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:,\d{3}){2,})", re.ASCII)
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 #: A cell that holds no sample.
@@ -71,7 +71,7 @@ _DAY_S = units.factor("day", "s")
 _MONITOR = re.compile(r"(\d\d:\d\d:\d\d\.\d{1,6}) -> ", re.ASCII)
 #: Bytes that are no text, as they are decoded: a zero, and what is no UTF-8.
 _NO_TEXT = re.compile("[\0\udc80-\udcff]")
-#: The signs of units, and blanks, in the alphabets of one byte that Excel writes in Europe.
+#: The signs of units, and blanks, in the single-byte alphabets that Excel writes in Europe.
 _SINGLE = {0xDC00 + code: chr(code) for code in b"\xa0\xb0\xb2\xb3\xb5\xb7\xb9\xba"}
 #: Texts in UTF-16, by the mark that they begin with.
 _WIDE = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
@@ -108,7 +108,7 @@ class TextReader:
         skip_bad: bool = False,
         opened: Opened | None = None,
     ) -> None:
-        """Read as far as the header. `files` closes the file. `knows`: whether a line of headings has a known one.
+        """Read as far as the header. `files` closes the file. `knows`: whether a line of headings has a known heading.
         `skip_bad`: leave out lines that are no row, and count them as `skipped`. `opened` opens a text in an archive.
         Raises UserError."""
         self.path = path
@@ -130,16 +130,16 @@ class TextReader:
         #: With `skip_bad`, after `columns`: int64[n], the place of each row among the lines after the header.
         self.places: Rows | None = None
         self._origin: datetime | None = None
-        #: Of a time of day: the first, the last one, and the days since, s.
+        #: First and last time of day, and the days since, s.
         self._day = (math.nan, math.nan, 0.0)
         #: Units after the numbers of a cell, by column.
         self._ending: dict[int, str] = {}
-        #: The column that numbers the sensors, and the cell of the one that is read.
+        #: The column that numbers the sensors, and the cell of the sensor that is read.
         self._only: tuple[int, str] | None = None
         self.where = f"line {number}: "
         headings = self._stated(_words(header) if self._separator == " " else _split(header, self._separator))
         if len(headings) == len(self._cells(self._batch[0])) + 1 and headings[-1].strip().lower() == _COMMENT_OF_ROWS:
-            del headings[-1]  # of LabVIEW, which writes the comment of a row only where there is one
+            del headings[-1]  # LabVIEW writes a cell for comments only in rows with a comment
         cells = self._cells(self._batch[0])
         if len(cells) == len(headings) + 1 and not cells[-1].strip():
             headings.append("")  # a separator ends each row
@@ -236,8 +236,8 @@ class TextReader:
         return whole
 
     def _kept(self, batch: list[str], before: int) -> list[str]:
-        """The lines of a block without those that repeat the header, and of one sensor alone. `before`: lines before
-        it, for the count of lines."""
+        """The lines of a block without those that repeat the header, and of a single sensor. `before`: lines before it,
+        for the count of lines."""
         if self._skip_bad:
             return batch
         again = {line for line in set(batch) if line.strip() in self._heads} if self._heads else set()
@@ -294,7 +294,7 @@ class TextReader:
         return text, header + 1, row + 1
 
     def _separated(self, header: str, row: str, number: int) -> str:
-        """The separator of columns: the one sign of the header that splits the first row in as many cells."""
+        """The separator of columns: the only sign of the header that splits the first row in as many cells."""
         present = [sign for sign in _SEPARATORS if sign in header]
         if len(present) > 1:
             fitting = [sign for sign in present if row.count(sign) == header.count(sign)]
@@ -331,7 +331,7 @@ class TextReader:
         return heading.strip()
 
     def _parse(self, lines: list[str], index: Sequence[int], time: int | None) -> Array | None:
-        """float64[lines, index] of lines, the fast way; None if it takes the slow one. `time`: a column of dates."""
+        """float64[lines, index] of lines, the fast way; None if it takes the slow way. `time`: a column of dates."""
         if self._lines.no_text:
             return None  # which lines have it is for the slow way
         if not lines or not index:
@@ -445,7 +445,7 @@ class TextReader:
         return float(cell)
 
     def _date(self, cell: str) -> float:
-        """Seconds since the first date. Raises ValueError, and TypeError where one has a zone and the other has not."""
+        """Seconds since the first date. Raises ValueError, and TypeError where dates with and without a zone meet."""
         cell = cell.strip(_QUOTED)
         if not _ISO.fullmatch(cell):
             return self._since_first(cell)
@@ -469,8 +469,8 @@ class TextReader:
 
 
 def in_turn(keys: Sequence[str], columns: Sequence[Sequence[str]]) -> list[tuple[str, str]]:
-    """The column by which the rows of several sensors take turns, and its cell for each of them; none of one.
-    `columns`: the cells of the first LOOKED_AT rows."""
+    """The column by which the rows of several sensors take turns, and its cell for each sensor; empty for a single
+    sensor. `columns`: the cells of the first LOOKED_AT rows."""
     numbering = number_of(keys)
     for key, cells in zip(keys, columns, strict=True):
         words = list(dict.fromkeys(cells))
@@ -516,7 +516,7 @@ def _words(line: str) -> list[str]:
     """The headings between blanks: a unit in brackets may stand apart, and have blanks in it."""
     headings: list[list[str]] = []
     within = False
-    for word in line.split(None, 8 * MOST_COLUMNS):  # the rest of a longer line is one word
+    for word in line.split(None, 8 * MOST_COLUMNS):  # the rest of a longer line is a word
         if headings and (within or word[0] in "[("):
             headings[-1].append(word)
         else:
@@ -536,7 +536,7 @@ def _split(line: str, sign: str) -> list[str]:
 
 
 def _with_signs(text: str) -> str:
-    """A text with the signs of units, in the lines before the first row, that some alphabets have as one byte."""
+    """A text with the signs of units, in the lines before the first row, that some alphabets have as a single byte."""
     end = 0
     for line in text.split("\n", MOST_LEADING_LINES)[:MOST_LEADING_LINES]:
         if is_row(line):
@@ -605,7 +605,7 @@ def _with_nan(text: str, separator: str) -> str:
 
 
 def _unquoted(cell: str) -> str | None:
-    """A cell without the spaces and the pair of quotes around it, in which two are one; None if one has no partner."""
+    """A cell without spaces and quotes around it; two quotes within become one. None if a quote has no partner."""
     text = cell.strip()
     if len(text) > 1 and text[0] == text[-1] == '"':
         return None if '"' in text[1:-1].replace('""', "") else text[1:-1].replace('""', '"')

@@ -16,7 +16,7 @@ from selfcal.logs.loaders import TEXT, ZIP
 from selfcal.logs.loaders.table import Field, Table, TableRows, meta_place, parse_meta
 from selfcal.logs.loaders.text_table import Opened, TextReader
 
-#: Where an app writes a sensor twice, the one to read comes first: what the part measured, before an estimate of it.
+#: Names of a sensor that an app writes twice, the name to read first: what the part measured, then an estimate of it.
 _BETTER = (("gyroscopeuncalibrated", "gyroscope"), ("accelerometeruncalibrated", "totalacceleration", "accelerometer"))
 
 
@@ -34,7 +34,7 @@ class Text:
     open: Opened | None = None
 
 
-#: Whether a line of headings has a known one.
+#: Whether a line of headings has a known heading.
 Knows = Callable[[Sequence[str]], bool]
 
 
@@ -82,7 +82,7 @@ class TextTable(Table):
 
 
 def read(path: Path, knows: Callable[[Text], Knows], skip_bad: bool) -> list[Table]:
-    """The tables of a text, or of the texts in a zip: one for each sensor whose rows take turns. Raises UserError."""
+    """The tables of a text or of a zip's texts: a table for each sensor whose rows take turns. Raises UserError."""
     tables: list[Table] = []
     for text in texts_in(path):
         try:

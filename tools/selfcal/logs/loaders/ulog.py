@@ -1,7 +1,7 @@
 """PX4's ULog by pyulog: a table a topic and instance.
 
 Stamps are those of the samples (`timestamp_sample`), where a topic has them. `sensor_gyro.0` and `sensor_accel.0` are
-one source, `sensor.0`; a FIFO topic holds several samples a message. The autopilot's number `sys_uuid` is the serial.
+the source `sensor.0`; a FIFO topic holds several samples a message. The autopilot's number `sys_uuid` is the serial.
 """
 
 from __future__ import annotations
@@ -64,10 +64,10 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _ends(data: Bytes) -> Callable[[int], int]:
-    """Where the message at a place ends. pyulog takes one of any kind and length, and passes by what follows.
+    """Where the message at a place ends. pyulog takes a message of any kind and length, and skips the data after it.
 
-    A message is its length, its kind, and so many bytes. One of a topic (D) begins with the number of a subscription
-    (A), and has the fields of a format (F). Source: PX4's description of ULog."""
+    A message is its length, its kind, and that many bytes. A message of a topic (D) begins with the number of a
+    subscription (A), and has the fields of a format (F). Source: PX4's description of ULog."""
     formats: dict[bytes, bytes] = {}
     lengths: dict[bytes, tuple[int, int]] = {}
 

@@ -21,8 +21,8 @@ def curve(problem: Problem) -> tuple[Array, Array, Array]:
 
 
 def slopes(problem: Problem) -> Answer:
-    """N from a line of slope -1/2 read at 1 s, K from one of slope +1/2 read at 3 s. Each line goes through the points
-    whose own slope is near its slope. No interval and no choice of a law: the method states none."""
+    """N from a line of slope -1/2 read at 1 s, K from a line of slope +1/2 read at 3 s. Each line goes through the
+    points whose own slope is near its slope. No interval and no choice of a law: the method has neither."""
     m, deviation, _ = curve(problem)
     ln_tau, ln_deviation = np.log(m * problem.dt_s), np.log(deviation)
     slope = np.gradient(ln_deviation, ln_tau) if m.size > 1 else np.array([-0.5])

@@ -15,7 +15,7 @@ LAGS_SHARE = 0.1
 
 
 def covariances(y: Array, u: Array, lags: int) -> Array:
-    """Of y[k] and u[k - lag], biased estimates [lags] about the means, from lag 0 on."""
+    """Covariances of y[k] and u[k - lag], biased estimates [lags] about the means, from lag 0 on."""
     size = fft.next_fast_len(2 * y.size, real=True)
     product = fft.rfft(y - y.mean(), size) * np.conj(fft.rfft(u - u.mean(), size))
     return np.asarray(fft.irfft(product, size)[:lags] / y.size)

@@ -1,7 +1,7 @@
 """The bank on a dense grid, written apart from the library and from its textbook reference: an oracle for the ensemble.
 
-One filter a node of (ln ratio, ln alpha), all nodes at once; the ratio is the drift's parameter over the white noise's.
-The bias and the white noise are integrated out at each node, the first in closed form.
+A filter for each node of (ln ratio, ln alpha), all nodes at once; the ratio is the drift's parameter over the white
+noise's. The bias and the white noise are integrated out at each node, the first in closed form.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ def nodes(problem: Problem, law: str) -> tuple[Array, Array]:
 
 
 def _sums(y: Array, phi: Array, step: Array, start: Array) -> tuple[Array, Array, Array, Array]:
-    """Sums of u^2 / s, u v / s, v^2 / s and ln s [m] over the innovations v of the readings and u of a constant 1, by
-    one Kalman filter a node with white noise of variance 1."""
+    """Sums of u^2 / s, u v / s, v^2 / s and ln s [m] over the innovations v of the readings and u of a constant 1, by a
+    Kalman filter for each node with white noise of variance 1."""
     p, x, w = start.copy(), np.zeros_like(phi), np.zeros_like(phi)
     A, B, C, D = (np.zeros_like(phi) for _ in range(4))
     for value in y.tolist():

@@ -1,4 +1,4 @@
-"""Dual estimation (Wan & Nelson 2001): one extended Kalman filter for level and drift, one for the parameters.
+"""Dual estimation (Wan & Nelson 2001): an extended Kalman filter for level and drift, another for the parameters.
 
 The filter of the parameters has two measurements. The first is the reading: its prediction depends on the parameters
 through the state and the gain, whose derivatives the sensitivity recursion carries (Ljung 1979). So the ratio of the

@@ -26,7 +26,7 @@ LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True)
 class Cell:
-    """One record of the ensemble: which law, how many samples, the seed."""
+    """A record of the ensemble: which law, how many samples, the seed."""
 
     law: str
     samples: int

@@ -63,7 +63,7 @@ def nodes(problem: Problem, law: str) -> tuple[Array, Array]:
 
 
 def kalman_filter(problem: Problem, law: str, theta: Array) -> KalmanFilter:
-    """Level and drift at one node."""
+    """Level and drift at a node."""
     kalman = KalmanFilter(dim_x=2, dim_z=1)
     kalman.H = np.ones((1, 2))
     kalman.R = np.array([[theta[0] ** 2 / problem.dt_s]])
@@ -76,8 +76,8 @@ def kalman_filter(problem: Problem, law: str, theta: Array) -> KalmanFilter:
 
 
 def estimates(problem: Problem, law: str, theta: Array, weight: Array) -> dict[str, Value]:
-    """Of each parameter the median and the interval, its density flat in ln within a cell. A law whose weight is no
-    longer a number of the machine has none."""
+    """Median and interval of each parameter, its density flat in ln within a cell. NaN if all weights underflow to
+    0."""
     if not weight.any():
         return {name: Value(math.nan) for name in NAMED[law].parameters}
     mass = weight / weight.sum()

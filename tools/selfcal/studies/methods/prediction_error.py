@@ -13,7 +13,7 @@ _ORDER = {"random_walk": (0, 1, 1), "gauss_markov": (1, 0, 1)}
 
 
 def arma(problem: Problem) -> Answer:
-    """Estimates without an interval: the coefficients' own is not one of N, K, sigma_m or alpha."""
+    """Estimates without an interval: the coefficients' own is not for N, K, sigma_m or alpha."""
     y, dt = problem.y - problem.y.mean(), problem.dt_s
     scale = float(y.std()) or 1.0
     by_law = {}

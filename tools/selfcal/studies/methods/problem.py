@@ -18,7 +18,7 @@ from selfcal.model.laws import NAMED
 
 #: The search leaves no start by more than this factor: beyond it the likelihood is flat or overflows.
 START_REACH = 1e5
-#: Step in the ln of a parameter for a curvature: a smaller one shows the rounding of an Allan variance.
+#: Step in the ln of a parameter for a curvature: a smaller step shows the rounding of an Allan variance.
 STEP = 0.01
 #: Sd of the first level of a Kalman filter, in sd of the record; the level begins at the first reading.
 FIRST_LEVEL_SD = 10.0
@@ -68,7 +68,7 @@ class Problem:
         return [np.log([N, long, 1.0 / (part * n * dt)]) for part in (0.2, 0.03, 0.005)]
 
     def peaks(self, objective: Callable[[str, Array], float], points: float = math.inf) -> dict[str, Peak]:
-        """The maximum of an objective of a law and ln parameters, by law; of laws that so many points determine."""
+        """The maximum of an objective of a law and ln parameters, by law; of laws that `points` readings determine."""
         return {law: maximum(partial(objective, law), self.starts(law)) for law in self.determined(points)}
 
     def determined(self, points: float) -> list[str]:
@@ -182,7 +182,7 @@ def hessian(objective: Callable[[Array], float], theta: Array) -> Array:
 
 
 def inverse(information: Array) -> Array:
-    """The inverse of a positive definite matrix; NaN for another one: the record does not determine the parameters."""
+    """The inverse of a positive definite matrix, else NaN: the record does not determine the parameters."""
     try:
         np.linalg.cholesky(information)
     except np.linalg.LinAlgError:

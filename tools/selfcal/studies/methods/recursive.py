@@ -46,7 +46,7 @@ def coefficients(y: Array, *, pole: bool) -> tuple[float, float, float]:
 
 
 def update(x: Array, P: Array, gradient: Array, error: float, kept: float = 1.0) -> tuple[Array, Array]:
-    """One step of recursive least squares: coefficients and covariance after a prediction `error`. `kept`: the weight
-    of all earlier samples."""
+    """A step of recursive least squares: coefficients and covariance after a prediction `error`. `kept`: the weight of
+    all earlier samples."""
     gain = P @ gradient / (kept + float(gradient @ P @ gradient))
     return x + gain * error, (P - np.outer(gain, gradient @ P)) / kept

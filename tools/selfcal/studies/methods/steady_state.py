@@ -1,5 +1,5 @@
 """The Kalman filter's likelihood with the steady-state gain from the first sample on (Ye, Bar-Shalom et al., IEEE
-Sensors J. 24(24), 2024; own derivation). One recursion a parameter value, the scale in closed form."""
+Sensors J. 24(24), 2024; own derivation). A recursion for each parameter value, the scale in closed form."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def steady_state(problem: Problem) -> Answer:
 
 
 def ln_likelihood(problem: Problem, law: str, ln_theta: Array) -> float:
-    """Of all samples but the first, or about the best constant where the law has a mean."""
+    """ln likelihood of all samples but the first, or about the best constant where the law has a mean."""
     y = problem.y
     r = math.exp(2.0 * ln_theta[0]) / problem.dt_s
     phi, q = map(float, problem.step(law, ln_theta) if law != "constant" else (0.0, 0.0))

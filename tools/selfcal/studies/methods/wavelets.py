@@ -22,8 +22,8 @@ _SECOND = ((0, 1.0), (1, -2.0), (2, 1.0))
 
 
 def covariance(terms: AllanTerms, m: Array, n: int) -> Array:
-    """Of the overlapping Allan variances [t, t] at `m` readings of a normal record of `n`: twice the sum of the squared
-    covariances of the differences behind them."""
+    """Covariance of the overlapping Allan variances [t, t] at `m` readings of a normal record of `n`: twice the sum of
+    the squared covariances of the differences behind them."""
     covariance = np.empty((m.size, m.size))
     for i, a in enumerate(m.tolist()):
         for k, b in enumerate(m.tolist()[: i + 1]):

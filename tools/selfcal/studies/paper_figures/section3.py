@@ -61,17 +61,17 @@ def over_time(model: Model, axis: str, dt_s: float, y: Array, marks: Sequence[in
 
 
 def by_chance(comparisons: int) -> float:
-    """Standard errors that the worst of so many comparisons exceeds by chance with the probability FALSE_ALARM."""
+    """Standard errors that the worst of `comparisons` exceeds by chance with the probability FALSE_ALARM."""
     return NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARM / comparisons)
 
 
 def own_seed(law: str, seed: int) -> int:
-    """A seed for each law: records of two laws with one seed share their noise."""
+    """A seed for each law: records of two laws with the same seed share their noise."""
     return int(np.random.SeedSequence([seed, list(NAMED).index(law)]).generate_state(1)[0])
 
 
 def rows_of(model: Model, job: tuple[str, int]) -> list[Row]:
-    """A row for each mark of a record, and one of the prior, at 0."""
+    """A row for each mark of a record, and a row of the prior, at 0."""
     law, seed = job
     group = model.group_of("gx")
     truth = draw_parameters(group, law, np.random.default_rng([seed, list(NAMED).index(law)]))
@@ -197,7 +197,7 @@ def choices(seed: int) -> dict[str, float]:
 
 
 def figures_3_and_4(seed: int) -> list[Reproduction]:
-    """Spectrum and Allan deviation of one record of each law with the true curves, and how well they choose a law."""
+    """Spectrum and Allan deviation of a record of each law with the true curves, and how well they choose a law."""
     group = Model.load(PAPER).group_of("gx")
     spectra: list[Panel] = []
     deviations: list[Panel] = []

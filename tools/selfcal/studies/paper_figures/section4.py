@@ -26,7 +26,7 @@ from selfcal.studies.paper_figures.section3 import PAPER, by_chance, over_time
 AXIS = "ax"
 #: The paper's result, of which the simulated records are made: m/s^2/sqrt(Hz), m/s^3/sqrt(Hz).
 PAPER_N, PAPER_K = 0.025, 2e-4
-#: Units of the pictures, with the size of one, and the paper's value.
+#: Units of the pictures, their sizes, and the paper's values.
 SHOWN = {"N": ("mm/s²/√Hz", 1e-3, PAPER_N), "K": ("m/s³/√Hz", 1.0, PAPER_K)}
 #: Four stretches of 3000 s that do not overlap: file, s of its beginning.
 STRETCHES = (
@@ -47,7 +47,7 @@ TRUTHS = {
     "random_walk": {"N": PAPER_N, "K": PAPER_K},
     "gauss_markov": {"N": PAPER_N, "sigma_m": PAPER_K * math.sqrt(SLOW_S / 2.0), "alpha": 1.0 / SLOW_S},
 }
-#: A computed rms is consistent if it is this near to the real one, which SCATTER records know no better.
+#: Largest ratio of a consistent computed rms to the real rms, which SCATTER records know no better.
 NEAR = 1.0 + by_chance(1) / math.sqrt(2.0 * SCATTER)
 #: Section 4.2, four areas: rms in mGal, correlation interval in min, white noise in mGal. The paper's Fig. 8 has 1 to
 #: 2, 50 to 200 and below 0.012. It does not give the interval between samples.
@@ -96,7 +96,7 @@ class Rms:
 
 
 def _rms(values: Sequence[Sequence[float]], stated: Sequence[Sequence[float]], truth: float) -> Rms:
-    """Of values and their stated sd of the logarithm, [records][marks]. A few Allan fits state none."""
+    """Real rms and median stated sd of ln `values`, by mark, of [records][marks]. A few Allan fits state no sd."""
     real = np.sqrt(((np.log(values) - math.log(truth)) ** 2).mean(axis=0))
     columns = [column[np.isfinite(column)] for column in np.array(stated).T]
     return Rms(real, np.array([np.median(column) if column.size else math.nan for column in columns]))
@@ -311,7 +311,7 @@ def _parameter(title: str, seen: Sequence[AxisResult], name: str, t: Array, line
 
 
 def figures_7(model: Model, records: Mapping[str, Array], seed: int) -> list[Reproduction]:
-    """N and K by the Allan variance; the rms that it computes against the real one; and both on the other law."""
+    """N and K by the Allan variance; the rms that it computes against the real rms; and both on the other law."""
     group = replace(model.group_of(AXIS), axes=(AXIS,))
     t = np.array(ALLAN_MARKS, dtype=float)
     fits = {
@@ -367,7 +367,7 @@ def figures_7(model: Model, records: Mapping[str, Array], seed: int) -> list[Rep
 def _both_ways(
     allan: Mapping[str, Mapping[tuple[str, str], Rms]], bank: Mapping[str, Mapping[tuple[str, str], Rms]], t: Array
 ) -> Reproduction:
-    """The claim of Fig. 7 on both truths, for the right law and the wrong one."""
+    """The claim of Fig. 7 on both truths, for the right law and the wrong law."""
     panels: dict[str, list[Panel]] = {"N": [], "drift": []}
     said: list[str] = []
     right: list[tuple[float, float]] = []

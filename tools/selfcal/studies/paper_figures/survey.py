@@ -1,11 +1,11 @@
 """Section 4.2 as an example: the errors of a gravity map by leaving out one track at a time.
 
-A vessel measures the gravity anomaly along parallel tracks. The field is a second-order Markov one, as gravimetry
+A vessel measures the gravity anomaly along parallel tracks. The field is a second-order Markov field, as gravimetry
 models it: covariance sigma^2 (1 + r/L) e^(-r/L). A track's readings have white noise and a slow error of their own, the
 gravimeter's drift, which is Gauss-Markov. The map at a track is the optimal interpolation of all other tracks. Its
 error is the difference from the track's readings. With C the covariance of all readings, that difference at track b is
 
-    (C^-1)_bb^-1 (C^-1 y)_b        so that one inverse leaves out each track in turn
+    (C^-1)_bb^-1 (C^-1 y)_b        so that a single inverse leaves out each track in turn
 
 The map maker knows the field's covariance, and counts the slow error as white noise.
 """
@@ -24,7 +24,7 @@ from selfcal.studies.paper_figures.section4 import AREA_SAMPLES, AREA_STEP_S, MG
 
 #: The field: rms, mGal, and length, km.
 FIELD_MGAL, FIELD_KM = 10.0, 12.0
-#: A track's own errors: slow ones over 150 min, and white noise, mGal.
+#: A track's own errors: slow errors over 150 min, and white noise, mGal.
 SLOW_MGAL, NOISE_MGAL = 1.0, 0.01
 #: Areas: tracks, all over the same width, km.
 TRACKS = {"area 1": 9, "area 2": 13, "area 3": 17, "area 4": 25}
