@@ -41,6 +41,8 @@ GVRET = "Time Stamp,ID,Extended,"
 #: Characters of a line, and bytes of an MCAP record and of a serial line without an end, at most: the rest of a longer
 #: line counts as another line.
 LONGEST_LINE = 1 << 16
+#: First lines of a text log that show its form, unless all of them are damaged.
+LINES_OF_FORM = 100
 #: Sound lines without a frame, by suffix.
 PASSED = {
     ".asc": re.compile(
@@ -280,8 +282,8 @@ def _reader_of(lines: _Lines) -> Any:
     import can
 
     suffix = lines.path.suffix.lower()
-    with lines.path.open("rb") as file:
-        first = file.read(LONGEST_LINE).decode("ascii", "replace").splitlines()  # a line of it may be damaged
+    with lines.path.open("rb") as file:  # lines of it may be damaged
+        first = [file.readline(LONGEST_LINE).decode("ascii", "replace").rstrip("\r\n") for _ in range(LINES_OF_FORM)]
     if suffix == ".csv" and "".join(first[:1]).startswith(GVRET):
         return _Foreign(lines, _of_gvret)
     if suffix == ".log" and any(CANDUMP.fullmatch(line) for line in first):
@@ -392,18 +394,29 @@ def _check_objects(path: Path, data: bytes) -> bytes:
 
 class McapFrames:
     """The frames of a file that McapLog wrote, as python-can's readers give them. A record of more than
-    LONGEST_LINE bytes ends it."""
+    LONGEST_LINE bytes ends it. So does the end of the last record: a writer that was killed leaves no summary."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb")
 
     def __iter__(self) -> Iterator[can.Message]:
         import can
+        from mcap.exceptions import EndOfFile
         from mcap.records import Channel, Message
         from mcap.stream_reader import StreamReader
 
         frames: set[int] = set()
-        for record in StreamReader(self._file, emit_chunks=True, record_size_limit=LONGEST_LINE).records:
+        end, records = 0, StreamReader(self._file, emit_chunks=True, record_size_limit=LONGEST_LINE).records
+        while True:
+            try:
+                record = next(records, None)
+            except EndOfFile:
+                if not end or self._file.tell() > end:  # amid a record
+                    raise
+                record = None
+            if record is None:
+                return
+            end = self._file.tell()
             if isinstance(record, Channel) and record.topic == FRAMES:
                 frames.add(record.id)
             elif isinstance(record, Message) and record.channel_id in frames:
