@@ -279,9 +279,10 @@ def _likeliest(stamps: _Stamps, rate: float | None) -> _Fit:
     if stamps.time.size <= _HEAD_ROWS or best.rival:
         return best
     near = [(law, fit.dt) for nats, law, fit in fits if nats < least + _HEAD_NATS]
-    near += [(_within if stamps.coarse else _phased, best.dt), (_counted, stamps.typical)]
+    # On a coarse lattice a clock that wanders over the record is written best by its count.
+    near += [(_within, best.dt)] if stamps.coarse else [(_phased, best.dt), (_counted, stamps.typical)]
     of_all = [fit for law, dt in dict.fromkeys(near) for fit in _tried(law, stamps, dt, rate)]
-    return min(of_all, key=lambda fit: fit[0])[1]
+    return min(of_all, key=lambda fit: fit[0], default=(0.0, _counted(stamps, stamps.typical)))[1]
 
 
 def _tried(law: _Law, stamps: _Stamps, dt: float, rate: float | None) -> list[tuple[float, _Fit]]:
