@@ -20,8 +20,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 RECORD = ROOT / "tests" / "long_runs.txt"
 HEAD = "# The last whole runs of what `make test` leaves out, by tests/long_run.py: name, UTC, commit, outcome.\n"
-#: Targets of the Makefile that run through here.
+#: Rooms of `make cases`.
 ROOMS = ("agree", "cases", "hidden", "lib", "tools")
+#: Targets of the Makefile that run through here.
 NAMES = ("campaigns", *(f"cases-{room}" for room in ROOMS), "tolerances", "soak", "emulate", "calibration")
 
 

@@ -227,7 +227,6 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 def _state() -> str:
     """The commit that is checked out; with changes, `-dirty` and a sum of them."""
-
     commands = ["git", "describe", "--always", "--dirty"], ["git", "diff", "HEAD"]
     commit, changes = (subprocess.run(each, cwd=ROOT, capture_output=True, check=False).stdout for each in commands)
     return (commit.decode().strip() or "unknown") + (f"-{zlib.crc32(changes):08x}" if changes else "")

@@ -25,7 +25,7 @@ from scipy.special import softmax
 from selfcal import _joint
 from selfcal.base.grid import Array, Mask
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS
+from selfcal.likelihood.statemodel import ALPHA_LIMITS, LN_SIZE
 from selfcal.logs.recording import bridged
 
 #: Least axes with a common quantity: two axes that go together share noise.
@@ -278,9 +278,9 @@ def fit_joint(bins: Bins, dt: float, f: bool, start: Joint | None = None, *, hel
     """The model of most likelihood, with f or without. `start`: a model near it, to which f is added if absent. If f is
     `held`, it stays as in `start`."""
     cost, m = _Cost(bins, f), bins.power.shape[1]
-    size, rate = np.log(SIZE_LIMITS), np.log(np.array(ALPHA_LIMITS) * dt)
+    rate = np.log(np.array(ALPHA_LIMITS) * dt)
     rate[1] = min(rate[1], math.log(2.0))
-    bounds = [(-4.0, 4.0), tuple(size), tuple(size), tuple(rate)] * m + [(-9.0, 9.0)] * (m * (m - 1) // 2)
+    bounds = [(-4.0, 4.0), LN_SIZE, LN_SIZE, tuple(rate)] * m + [(-9.0, 9.0)] * (m * (m - 1) // 2)
     common = (rate[0], min(rate[1], math.log(dt / FASTEST_S)))
     bounds += [(-50.0, 50.0)] * m + [common] if f else []
     own = np.tile([0.0, -4.0, -1.5, math.log(0.01 * dt)], (m, 1)) if start is None else start.own

@@ -20,12 +20,10 @@ from selfcal.model.laws import DAMPING_LIMITS, lost_of, swing
 
 #: Limits of a Gauss-Markov drift's correlation rate, 1/s, from the default model: faster noise is coloured noise.
 ALPHA_LIMITS = ABOUT_N["alpha"][:2]
-#: Limits of a size relative to the white noise of a sample.
-SIZE_LIMITS = (1e-5, 1e2)
 #: Limits of the period of a drift that oscillates, s: a faster oscillation is a band.
 PERIOD_LIMITS = (20.0, 3000.0)
-#: Limits of ln of a size.
-LN_SIZE = (math.log(SIZE_LIMITS[0]), math.log(SIZE_LIMITS[1]))
+#: Limits of ln of a size relative to the white noise of a sample.
+LN_SIZE = (math.log(1e-5), math.log(1e2))
 
 
 @dataclass(frozen=True)

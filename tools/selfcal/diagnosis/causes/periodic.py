@@ -158,17 +158,22 @@ def _line(state: State, record: Record) -> list[Look]:
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
-    """The look at a line of a known frequency, and multiples of it: several axes have them in common. Without columns
-    where the axis has a swing within an octave that forgets its phase: two such swings share lines by chance."""
+    """The look at a line of a known frequency, and multiples of it."""
     multiples = [round(k) for k in theta[1:] if k * theta[0] < 0.5 * record.rate_hz]
     known = shape(state, record, theta[0], multiples=multiples)
-    look = columns.located(state, "periodic", replace(known, sharper=None))
+    return columns.located(state, "periodic", replace(known, sharper=None))
+
+
+def in_common(state: State, record: Record, theta: Sequence[float]) -> Look:
+    """The look at a line that several axes have in common. Without columns where the axis has a swing within an octave
+    that forgets its phase: two such swings share lines by chance."""
+    look = at(state, record, theta)
     slow = theta[0] * state.y.size * state.dt < SLOW_TURNS and not state.extras.oscillation
     wanders = swing.found(state, slow=True) if slow else None
     if wanders is None or wanders.keeps_phase or wanders.gain < look.gain + ALIKE:
         return look
     near = abs(math.log2(theta[0] * wanders.numbers[0])) < 1.0
-    return replace(look, shape=replace(known, regressors=())) if near else look
+    return replace(look, shape=replace(look.shape, regressors=())) if near and look.shape else look
 
 
 def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
@@ -303,7 +308,7 @@ CAUSE = Cause(
     _advice,
     source="surroundings",
     looks=looks,
-    at=at,
+    at=in_common,
     pictures=_pictures,
     least=_least,
     grouping=Grouping(alike=_alike, settle=_settle),
